@@ -7,14 +7,35 @@ from typing import Any
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 
+from maasi_msgs.msg import Report
 from maasi_msgs.srv import AddSighting, MarkSearched, ReviewTarget
 
-_KINDS = {
+KINDS = {
     'review_target': ReviewTarget,
     'add_sighting': AddSighting,
     'mark_searched': MarkSearched,
 }
 _SETTLED = 1.0  # discovery ends this long after the last new service [s]
+
+
+def request_of(report: Report) -> tuple[str, Any]:
+    """Return service and request of a published statement."""
+    if report.kind == Report.SIGHTING:
+        request = AddSighting.Request(
+            position=report.position, radius=report.radius, weight=report.weight
+        )
+        service = 'add_sighting'
+    elif report.kind == Report.SEARCHED:
+        request = MarkSearched.Request(zone=report.zone, detection_probability=report.weight)
+        service = 'mark_searched'
+    else:
+        confirmed = report.kind == Report.CONFIRMED
+        request = ReviewTarget.Request(
+            id=report.target, confirmed=confirmed, reliability=report.weight
+        )
+        service = 'review_target'
+    request.source = report.source
+    return service, request
 
 
 def call_filters(
@@ -26,7 +47,7 @@ def call_filters(
     """
     executor = SingleThreadedExecutor(context=node.context)
     executor.add_node(node)
-    kind, top = _KINDS[service], f'/{space}' if space else ''
+    kind, top = KINDS[service], f'/{space}' if space else ''
     request: Any = kind.Request()
     for name, value in fields.items():
         if name == 'position':

@@ -12,13 +12,16 @@ from typing import Any
 
 import numpy as np
 import rclpy
+from rclpy.client import Client
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.serialization import deserialize_message
 from rclpy.signals import SignalHandlerOptions
+from rclpy.task import Future
 
 from maasi_filter.ros.qos import LATCHED_ALL, RELIABLE, UPDATES
+from maasi_filter.ros.report_client import KINDS, request_of
 from maasi_filter.wording import counted
 from maasi_msgs.msg import (
     DetectionArray,
@@ -26,6 +29,7 @@ from maasi_msgs.msg import (
     FoundTargetArray,
     LockstepDone,
     MeasurementBatch,
+    Report,
 )
 from maasi_sim.run.bag import Bag, BagError
 from maasi_sim.run.domain import Domain
@@ -33,7 +37,7 @@ from maasi_sim.run.ending import Interruption
 from maasi_sim.run.node_plan import NodePlan
 from maasi_sim.run.processes import NodeProcess, stop
 from maasi_sim.run.run_folder import make_folder
-from maasi_sim.run.topics import BATCH, FOUND, UPDATE, within
+from maasi_sim.run.topics import BATCH, FOUND, REPORTS, UPDATE, within
 
 FILTER = 'filter_node'
 EQUAL, DIFFERENT, FAILED, INTERRUPTED = 0, 1, 3, 130
@@ -60,6 +64,8 @@ class Batch:
     detections: list[bytes]
     namespace: str
     late: bool
+    # : Statements of persons that the filter used before it.
+    reports: list[Report] = field(default_factory=list)
 
 
 @dataclass
@@ -92,7 +98,8 @@ def read_recording(path: Path) -> Recording:
             # A restarted driver repeats an index; the filter used the first one.
             detections.setdefault((topics[topic], index), data)
         for namespace in list(recording.found):
-            last = 0
+            last = told = 0
+            reports = _reports_of(bag, within(team, within(namespace, REPORTS)))
             for _, _, _, data in bag.raw([within(team, within(namespace, UPDATE))]):
                 update = deserialize_message(data, FilterUpdate)
                 used = []
@@ -105,12 +112,26 @@ def read_recording(path: Path) -> Recording:
                     used.append(detections[robot, index])
                 late = update.batch_id <= last
                 last = max(last, update.batch_id)
-                recording.batches.append(Batch(update, used, namespace, late))
+                new = [item for item in reports if told < item.id <= update.reports]
+                told = max(told, update.reports)
+                recording.batches.append(Batch(update, used, namespace, late, new))
             for _, _, _, data in bag.raw([within(team, within(namespace, FOUND))]):
                 recording.found[namespace] = deserialize_message(data, FoundTargetArray)
     if len(recording.found) > 1:
         recording.batches.sort(key=lambda batch: (batch.update.step, batch.namespace))
     return recording
+
+
+def _reports_of(bag: Bag, topic: str) -> list[Report]:
+    found: dict[int, Report] = {}
+    for _, _, _, data in bag.raw([topic]):
+        report = deserialize_message(data, Report)
+        if report.kind == Report.CLEARED:
+            found.clear()
+        else:
+            # A restarted filter repeats those that it knows.
+            found.setdefault(report.id, report)
+    return list(found.values())
 
 
 class ReplayNode:
@@ -136,6 +157,7 @@ class ReplayNode:
         )
         self.node = Node('replay', context=self.context, use_global_arguments=False)
         self.updates: list[FilterUpdate] = []
+        self._clients: dict[str, Client] = {}
         self.found = {name: FoundTargetArray() for name in namespaces}
         self._awaited = {within(name, f'/{FILTER}') for name in namespaces}
         self._batches = {
@@ -180,6 +202,16 @@ class ReplayNode:
             )
         for member, data in zip(update.members, batch.detections):
             self._detections[member.robot].publish(deserialize_message(data, DetectionArray))
+
+    def state(self, namespace: str, report: Report) -> Future:
+        """Make the statement of a person to a filter again; return its answer to come."""
+        service, request = request_of(report)
+        name = within(namespace, f'/search/{service}')
+        if name not in self._clients:
+            self._clients[name] = self.node.create_client(KINDS[service], name)
+        client = self._clients[name]
+        client.wait_for_service(_PATIENCE)
+        return client.call_async(request)
 
     def _on_ready(self, message: LockstepDone) -> None:
         self._awaited.discard(message.node)
@@ -259,6 +291,9 @@ def _feed(
 
     wait_for(lambda: node.ready, 'the filter was not ready', _START_PATIENCE)
     for number, batch in enumerate(recording.batches, start=1):
+        for report in batch.reports:
+            answer = node.state(batch.namespace, report)
+            wait_for(answer.done, f'no answer to statement {report.id}')
         node.publish(batch)
         wait_for(
             lambda number=number: len(node.updates) >= number,  # type: ignore[misc]
