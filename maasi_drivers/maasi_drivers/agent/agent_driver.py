@@ -18,6 +18,7 @@ from maasi_drivers.agent.sensor_input import SensorInput
 from maasi_drivers.agent.watchdog import PERIOD, StatePublisher, Watchdog
 from maasi_drivers.agent.waypoint_follower import GoalStatus, WaypointFollower
 from maasi_drivers.links.robot_link import RobotLink
+from maasi_drivers.settings.driver import TERRAIN_LINKS
 from maasi_filter.geometry.area import Area
 from maasi_filter.geometry.operating_volume import MARGIN
 from maasi_filter.models.pose import Pose
@@ -93,6 +94,11 @@ class AgentDriver(RobotNode):
                 + ' or '.join(self._links)
             )
         super().prepare()
+        if self.volume.area.terrain is not None and settings.link not in TERRAIN_LINKS:
+            raise SettingsError(
+                f'parameter environment.terrain.file: read {settings.environment.terrain.file}, '
+                f'allowed with link {settings.link} is none: the driver does not control its height'
+            )
         self.link = self._links[settings.link](self)
         self.sensor_input = self._make_sensor(self)
         self._opened = [self.sensor_input]

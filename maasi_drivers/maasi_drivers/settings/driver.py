@@ -32,6 +32,7 @@ LINKS: dict[str, tuple[str, ...]] = {
     'mavlink_driver': ('topics', 'mavlink'),
     'mavlink_camera_driver': ('topics', 'mavlink'),
 }
+TERRAIN_LINKS = ('topics', 'mavlink')  # which keep flying robots above ground that is not flat
 DRIVERS = PluginGroup(
     'maasi.drivers',
     'driver',

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from maasi_drivers.settings.driver import DRIVERS, LINKS
+from maasi_drivers.settings.driver import DRIVERS, LINKS, TERRAIN_LINKS
 from maasi_drivers.settings.vehicles import MamboSettings
 from maasi_filter.geometry.area import Area
 from maasi_filter.geometry.environment import EnvironmentSettings
@@ -117,10 +117,10 @@ def _terrain_problems(robot: RobotSettings, area: Area) -> Problems:
     """Yield what a robot cannot do over terrain."""
     if area.terrain is None:
         return
-    if robot.motion.model == 'mambo' or robot.link.startswith('mambo'):
+    if robot.link not in TERRAIN_LINKS:
         yield (
-            f"motion.model: read '{robot.motion.model}' with link {robot.link} and "
-            'environment.terrain; allowed with it are other robots: a Mambo flies above a floor'
+            f'link: read {robot.link} with environment.terrain; allowed with it are '
+            f'{" and ".join(TERRAIN_LINKS)}: the driver does not control heights of the others'
         )
     elif robot.flies and robot.start[2] < least_height(robot):
         yield (

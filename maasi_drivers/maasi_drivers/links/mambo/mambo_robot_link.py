@@ -54,11 +54,6 @@ class MamboRobotLink(RobotLink):
     def prepare(self) -> None:
         """Make link and geofence; check that a connection is possible."""
         driver, mambo, settings = self.driver, self._mambo, self.driver.settings
-        if driver.volume.area.terrain is not None:
-            raise SettingsError(
-                f'parameter environment.terrain.file: read {settings.environment.terrain.file}, '
-                f'allowed with link {settings.link} is none: a Mambo flies above a floor'
-            )
         driver.volume = flight_volume(driver.volume.area, settings, mambo)
         if settings.motion.model == 'unicycle':
             raise SettingsError(

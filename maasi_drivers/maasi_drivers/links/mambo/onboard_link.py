@@ -77,11 +77,6 @@ class OnboardLink(RobotLink):
                 'mambo_feed is feed'
             )
         driver.feed_peer = FeedPeer(mambo.address, self._handle_feed_pose)
-        if driver.volume.area.terrain is not None:
-            raise SettingsError(
-                f'parameter environment.terrain.file: read {settings.environment.terrain.file}, '
-                f'allowed with link {settings.link} is none: a Mambo flies above a floor'
-            )
         driver.volume = flight_volume(driver.volume.area, settings, mambo)
         # Positions of the feed are relative to this.
         self._origin = Pose.from_yaw([*settings.start[:2], mambo.ground], settings.yaw)
