@@ -16,7 +16,7 @@ from maasi_filter.unexplored_map import UnexploredMap
 from maasi_planner import MotionSettings, RobotState, RobotView, TeamView, make_motion, make_planner
 from maasi_planner.endurance import NOTHING_AFFORDABLE, Endurance, EnduranceSettings, Phase
 from maasi_planner.planners.base import check_decision
-from maasi_planner.planners.lattice import Lattice, passing
+from maasi_planner.planners.lattice import Lattice, passing, turned
 from maasi_planner.team import SAVES_BATTERY
 from maasi_sim.scenario.loading import load_scenario
 from maasi_sim.search import search
@@ -83,6 +83,9 @@ def test_lanes_lie_askew_in_a_large_area_where_the_box_is_wider_so():
     assert lengths.sum() < 0.9 * 0.8 * 40.0**2 / 2.0
     askew = np.abs(np.abs(steps[:, 0]) - np.abs(steps[:, 1])) < 0.1 * lengths
     assert lengths[askew].sum() > 0.6 * lengths.sum()
+    # A corner leaves parts of a turned cell unseen: most of the path is parallel to one diagonal.
+    along = np.sort(np.abs(steps @ turned(0.25 * np.pi, 2)).sum(axis=0))
+    assert along[1] > 3.0 * along[0]
 
 
 def test_a_wide_view_visits_few_places_and_then_those_between():

@@ -31,8 +31,12 @@ PARTS, FEWER, FINE = 4, 2, 2_000_000
 SMALL = 0.3
 # A cell with less than this share unseen is passed in the centre of that part.
 WHOLE = 0.95
-# Cells are turned if that makes them wider by this factor, in areas of so many cells.
-ASKEW, LARGE = 1.1, 200
+# Cells are turned if that makes them wider by this factor, in areas of so many cells in all or for
+# each robot: elsewhere the corners of turned cells cancel the gain.
+ASKEW, LARGE, EACH = 1.1, 200, 60
+# A corner of a tour leaves parts of a turned cell unseen: with at least so many for each robot,
+# tours are planned as if their second axis were longer by this factor, so that lanes are straight.
+STRAIGHT, LONG = 1.5, 45
 
 
 def passing(
@@ -90,8 +94,8 @@ def lanes_of(team: TeamView) -> tuple[float, FloatArray, FloatArray, float]:
         return min(lanes, key=lambda lane: lane[0])
 
     level = narrowest(0.0)
-    # In small areas the corners of turned cells cancel the gain.
-    if team.dimension == 3 or team.exploration.volume < LARGE * level[0] ** 2:
+    least = min(LARGE, EACH * len(team.robots))
+    if team.dimension == 3 or team.exploration.volume < least * level[0] ** 2:
         return level
     askew = narrowest(0.25 * math.pi)
     return askew if askew[0] > ASKEW * level[0] else level
@@ -103,7 +107,8 @@ class Lattice:
     If that gives few cells, 0.9 replaces the half, for a finer choice of positions.
 
     turn (d, d): axes of the cells, in columns; kernel: probability of detection in passing, by
-    offset in cells; trust (n,): factor on the gain of a visit, which its user can reduce.
+    offset in cells; trust (n,): factor on the gain of a visit, which its user can reduce; area: of
+    all cells, in cells.
     """
 
     def __init__(
@@ -133,6 +138,7 @@ class Lattice:
         self._parts = csr_array(table, (number, nodes))
         self._sizes = _cell_sizes(samples)
         self._held, sums = _middles(samples, cells, number)
+        self.area = float(self._held.sum() / widths.prod())
         self._centres = sums[:, :d] / np.maximum(self._held, 1e-12)[:, None]
         centres = (low + (np.indices(tuple(counts)).reshape(d, -1).T + 0.5) * widths) @ self.turn.T
         whole = np.abs(self._held / widths.prod() - 1.0) < 1.0 - WHOLE
@@ -143,6 +149,13 @@ class Lattice:
         offsets = np.meshgrid(*(np.arange(-count, count + 1) for count in reach), indexing='ij')
         squared = sum((offset * width) ** 2 for offset, width in zip(offsets, widths))
         self.kernel = np.interp(np.sqrt(squared), lateral, detected, right=0.0)
+
+    def frame(self, robots: int) -> FloatArray:
+        """Return the axes (d, d), in columns, in which tours of so many robots are planned."""
+        axes = self.turn.copy()
+        if self.turn[0, 1] != 0.0 and self.area >= LONG * robots:
+            axes[:, 1] *= STRAIGHT
+        return axes
 
     def unseen(self, exploration: UnexploredMap) -> FloatArray:
         """Return the share of all targets that is unseen in each cell, (nx, ny, nz)."""

@@ -156,9 +156,10 @@ class Tour(Planner):
                 prizes[gaps < SAME * lattice.pitch] = 0.0
         speeds = np.array([team.robots[name].motion.settings.speed for name in names])
         homes = np.array(ends) if np.isfinite(budgets).any() else None
-        # Lanes are those of the lattice.
-        points, origins = self.points @ lattice.turn, np.array(starts) @ lattice.turn
-        homes = None if homes is None else homes @ lattice.turn
+        # Lanes are those of the lattice; budgets are true lengths.
+        frame = lattice.turn if homes is not None else lattice.frame(len(names))
+        points, origins = self.points @ frame, np.array(starts) @ frame
+        homes = None if homes is None else homes @ frame
         rows = {cell: row for row, cell in enumerate(self._chosen.tolist())}
         known = [
             np.array([rows[i] for i in before.get(name, []) if i in rows], np.int64)
