@@ -10,10 +10,13 @@ from sensor_msgs.msg import Image
 from maasi_drivers.settings.camera import CameraSettings
 from maasi_drivers.vision.camera_model import Camera
 from maasi_filter.models.pose import Pose
+from maasi_filter.records import FoundTarget
+from maasi_sim.run import facts
 from maasi_sim.run.missions import load_mission
 from maasi_sim.run.view.event_log import EventLog
+from maasi_sim.run.view.event_maker import EventMaker
 from maasi_sim.run.view.page_file import write_replay
-from maasi_sim.run.view.pictures import picture
+from maasi_sim.run.view.pictures import cut_out, picture
 from maasi_sim.run.view.scene import scene_of
 
 ROBOTS = scene_of('demo', load_mission('mambo_turtlebot').scenario)['robots']
@@ -96,3 +99,59 @@ def test_the_page_dims_what_is_not_counted(chromium, tmp_path):
         assert 'Dimmed' in shown.page.inner_text('#cameras')
         frame, drawn = (figure.locator(part).bounding_box() for part in ('img', 'svg'))
         assert [frame[key] for key in frame] == pytest.approx([drawn[key] for key in drawn], abs=1)
+
+
+def seen_position(rng, robot, pose):
+    """Return a position on the floor that is in the image."""
+    model = Camera.from_settings(CameraSettings(**robot['camera']))
+    while True:
+        floor = np.append(pose.position[:2] + rng.uniform(-0.3, 0.3, 2), 0.0)
+        pixel = model.project(floor[None], pose)[0]
+        if (pixel > 8).all() and (pixel < (model.width - 8, model.height - 8)).all():
+            return floor
+
+
+def test_a_find_has_the_picture_of_the_measurement_that_completed_it():
+    rng, robot, events = np.random.default_rng(1), ROBOTS['mambo'], []
+    maker = EventMaker(scene_of('demo', load_mission('mambo_turtlebot').scenario), events.append)
+    pose = Pose.from_yaw([1.0, 1.0, 1.0], 0.3)
+    floor = seen_position(rng, robot, pose)
+    for index, place in ((3, floor), (4, floor + 0.1)):
+        message = image_of(robot['camera'], place[None], pose)
+        seen = facts.Measured(float(index), 'mambo', pose.position, pose, [], None, index)
+        maker.add(facts.Photographed(seen.time, seen, message))
+        if index == 3:
+            expected = cut_out(message, robot, pose, floor.round(3))
+    found = [FoundTarget(1, floor[:2].round(3), np.eye(2), 'mambo', 3, 5.0)]
+    # Found by a robot without an image.
+    found.append(FoundTarget(2, floor[:2], np.eye(2), 'turtlebot', 1, 5.0))
+    maker.add(facts.Found(5.0, '', found, 1))
+    maker.add(facts.Found(6.0, '', found, 2))
+    assert [event[:4] for event in events if event[1] == 'crop'] == [[5.0, 'crop', '', 1]]
+    assert next(event[4] for event in events if event[1] == 'crop') == expected
+
+
+@pytest.mark.parametrize('seed', range(6))
+def test_the_picture_of_a_target_is_the_part_of_the_image_around_it(seed):
+    rng = np.random.default_rng(seed)
+    robot = ROBOTS['mambo']
+    pose = Pose.from_yaw([1.0, 1.0, float(rng.uniform(0.7, 1.5))], float(rng.uniform(-3.0, 3.0)))
+    floor = seen_position(rng, robot, pose)
+    message = image_of(robot['camera'], floor[None], pose)
+    data = base64.b64decode(cut_out(message, robot, pose, floor))
+    assert len(data) < 8000
+    shown = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR).astype(int)
+    assert max(shown.shape[:2]) <= 96
+    # Blue, and in its middle unless the image ends there.
+    rows, columns = np.nonzero((shown[:, :, 0] > 150) & (shown[:, :, 2] < 100))
+    model = Camera.from_settings(CameraSettings(**robot['camera']))
+    column, row = model.project(floor[None], pose)[0]
+    assert len(rows) > 20
+    if 40 < column < model.width - 40 and 40 < row < model.height - 40:
+        assert abs(rows.mean() - 0.5 * shown.shape[0]) < 3.0
+        assert abs(columns.mean() - 0.5 * shown.shape[1]) < 3.0
+    # Not in the image, behind the camera, or without a camera.
+    far, above = np.array([50.0, 0.0, 0.0]), np.array([0.0, 0.0, 5.0])
+    assert cut_out(message, robot, pose, floor + far) is None
+    assert cut_out(message, robot, pose, pose.position + above) is None
+    assert cut_out(message, {}, pose, floor) is None

@@ -1,11 +1,14 @@
 """Statements of persons on the page: buttons, clicks on the map, what the filter receives."""
 
+import base64
 import json
 import threading
 import urllib.error
 import urllib.request
 from contextlib import closing
 
+import cv2
+import numpy as np
 import pytest
 import rclpy
 import shapely
@@ -27,6 +30,7 @@ EVENTS = [
     [0.0, 'robot', 'rover', [5.0, 5.0, 0.0, 0.0], 1.0, 1, ''],
     [3.0, 'found', '', FOUND],
 ]
+PIXEL = base64.b64encode(cv2.imencode('.jpg', np.zeros((2, 3, 3), np.uint8))[1]).decode()
 ZONE = [{'kind': 'searched', 'rings': [[[10, 10], [40, 10], [40, 40], [10, 10]]]}]
 REPORTS = [
     [4.0, 'report', '', 'sighting', 0, [70.0, 20.0, 0.0], 8.0, 0.5, []],
@@ -79,7 +83,7 @@ def test_found_targets_have_buttons_and_the_map_takes_sightings_and_searched_gro
     with chromium() as shown:
         shown.open(server.address)
         shown.until("document.querySelectorAll('#finds tr').length == 2")
-        assert [row[:3] for row in rows(shown)] == [
+        assert [row[1:4] for row in rows(shown)] == [
             ['1', '(20, 30) m', 'found by rover at 2 s'],
             ['2', '(60, 50) m', 'found by rover at 3 s'],
         ]
@@ -131,7 +135,8 @@ def test_found_targets_have_buttons_and_the_map_takes_sightings_and_searched_gro
 
 
 def test_a_replay_shows_statements_without_buttons(chromium, tmp_path):
-    write_replay(EventLog(SCENE, [*EVENTS, *REPORTS]), tmp_path / 'page.html')
+    crop = [3.0, 'crop', '', 2, PIXEL]
+    write_replay(EventLog(SCENE, [*EVENTS, crop, *REPORTS]), tmp_path / 'page.html')
     with chromium() as shown:
         shown.open((tmp_path / 'page.html').as_uri())
         assert not shown.page.is_visible('button[data-report=sighting]')
@@ -142,11 +147,15 @@ def test_a_replay_shows_statements_without_buttons(chromium, tmp_path):
         shown.seek(7.0)
         legend = shown.page.inner_text('#legend')
         assert 'sighting' in legend and 'searched by others' in legend
-        assert [row[2] for row in rows(shown)] == [
+        assert [row[3] for row in rows(shown)] == [
             'rejected',
             'found by rover at 3 s, confirmed 1 time',
         ]
         assert shown.page.locator('#finds button').count() == 0
+        images = shown.page.locator('#finds img')
+        assert images.count() == 1
+        assert images.get_attribute('alt') == 'Target 2 as its robot saw it'
+        assert images.evaluate('(image) => image.decode().then(() => image.naturalWidth)') == 3
         tips = []
         for corner in ([70, 20], [30, 20]):
             x, y = shown.page.evaluate(f'maasi.camera.project({[*corner, 0]})')[:2]

@@ -1,6 +1,7 @@
 """Makes the events of a page from facts."""
 
 import math
+from collections import deque
 from collections.abc import Sequence
 from typing import Any
 
@@ -13,7 +14,7 @@ from maasi_filter.wording import point
 from maasi_sim.run import facts
 from maasi_sim.run.scores import Scoreboard
 from maasi_sim.run.view.event_log import STATE_PERIOD, Event, Listener, Scene, Thinning, shades
-from maasi_sim.run.view.pictures import picture
+from maasi_sim.run.view.pictures import cut_out, picture
 from maasi_sim.run.view.scene import zones_as
 
 _NOT_ALLOWED = -1e29  # candidates with an objective below this are not allowed
@@ -21,6 +22,7 @@ _NOT_ALLOWED = -1e29  # candidates with an objective below this are not allowed
 MOVING, UNAVAILABLE, LEFT, SILENT, ENDED = 1, 5, 6, 7, 8
 _SILENCE = 3.0  # a robot is silent after this long without a state, if others send theirs [s]
 _MOST_POINTS = 40  # shown points of a planned path
+_PHOTOGRAPHS = 4  # kept images of a robot
 _MOST_WAYPOINTS = 400  # shown points of a tour
 
 
@@ -59,6 +61,8 @@ class EventMaker:
         # Last time, position and battery of each robot.
         self._states: dict[str, tuple[float, list[float], float]] = {}
         self._modes: dict[str, str] = {}
+        # The last images of measurements, by robot.
+        self._photographs: dict[str, deque[facts.Photographed]] = {}
         self._measured: set[tuple[str, str, int]] = set()
         self.latest = 0.0  #: latest time of an event [s]
 
@@ -196,6 +200,8 @@ class EventMaker:
         except ValueError:
             # Images that cannot be decoded are not shown.
             return
+        kept = self._photographs.setdefault(item.robot, deque(maxlen=_PHOTOGRAPHS))
+        kept.append(fact)
         self._put(fact.time, 'picture', item.robot, *content)
 
     def _robot(self, name: str) -> dict[str, Any]:
@@ -220,9 +226,25 @@ class EventMaker:
             rows.append([item.id, *position, _upper(item.covariance), item.robot, when])
             if item.id not in before:
                 self._say(time, item.robot, 'found', f'target {item.id} at {point(position)} m')
+                self._add_cut_out(time, team, item, position)
         self._board.found[team] = targets
         self._put(time, 'found', team, rows)
         self._score(time)
+
+    def _add_cut_out(
+        self, time: float, team: str, target: FoundTarget, position: Sequence[float]
+    ) -> None:
+        """Add the part of an image of its finder that shows a target, if there is one."""
+        photographs = self._photographs.get(target.robot, ())
+        # First the measurement of the find, then the newest.
+        own = [item for item in photographs if item.measured.index == target.measurement]
+        for fact in (*own, *reversed(photographs)):
+            pose = fact.measured.pose
+            assert pose is not None
+            data = cut_out(fact.image, self._robot(target.robot), pose, position)
+            if data is not None:
+                self._put(time, 'crop', team, target.id, data)
+                return
 
     def _add_report(self, fact: facts.Reported) -> None:
         report = fact.report

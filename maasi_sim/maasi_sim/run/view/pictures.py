@@ -22,6 +22,9 @@ _WIDTH, _QUALITY, _PERIOD = 240, 60, 0.5
 _KEPT = 16  # images of a camera that wait for their detections
 # Points per side of a sensor's box, and the margin around it relative to its size.
 _POINTS, _AROUND = 25, 0.06
+# Part of an image around a target: half its size in diameters of a marker, and at least [px];
+# largest size that is shown [px].
+_AROUND_TARGET, _LEAST_HALF, _CUT_OUT = 2.0, 16.0, 96
 
 
 class Pictures:
@@ -83,6 +86,41 @@ def picture(message: Any, robot: dict[str, Any], pose: Pose, values: ArrayLike) 
     rows = None if marks is None else (marks - [*corner, 0.0]).round(1).tolist()
     text = base64.b64encode(data).decode()
     return [text, [width, height], rows, (outline - corner).round(1).tolist()]
+
+
+def cut_out(message: Any, robot: dict[str, Any], pose: Pose, position: ArrayLike) -> str | None:
+    """Return the part of an image around a position (3,) [m] as JPEG in base64.
+
+    None if the camera is unknown, or the position is not in the image.
+    """
+    camera = robot.get('camera')
+    if camera is None:
+        return None
+    # Deferred, as in `picture`.
+    import cv2
+
+    from maasi_drivers.settings.camera import CameraSettings
+    from maasi_drivers.vision.camera_model import Camera
+    from maasi_drivers.vision.images import decode_image, image_to_array
+
+    model, place = Camera.from_settings(CameraSettings(**camera)), np.asarray(position)
+    around = place + np.array([[0.0, 0.0, 0.0], [camera['marker_diameter'], 0.0, 0.0]])
+    middle, edge = model.project(around, pose)
+    if not np.isfinite([*middle, *edge]).all():
+        return None
+    image = image_to_array(message) if hasattr(message, 'encoding') else decode_image(message)
+    limits = np.array(image.shape[1::-1])
+    if not ((middle >= 0.0) & (middle < limits)).all():
+        return None
+    half = max(_AROUND_TARGET * float(np.linalg.norm(edge - middle)), _LEAST_HALF)
+    left, top = np.clip(np.floor(middle - half), 0, limits - 1).astype(int)
+    right, bottom = np.clip(np.ceil(middle + half), 1, limits).astype(int)
+    part = image[top:bottom, left:right]
+    shrink = min(1.0, _CUT_OUT / max(part.shape[:2]))
+    size = [max(1, round(shrink * length)) for length in part.shape[1::-1]]
+    small = cv2.resize(part[:, :, ::-1], size, interpolation=cv2.INTER_AREA)
+    data = cv2.imencode('.jpg', small, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1].tobytes()
+    return base64.b64encode(data).decode()
 
 
 def _marks(model: 'Camera', radius: float, pose: Pose, values: ArrayLike) -> FloatArray:

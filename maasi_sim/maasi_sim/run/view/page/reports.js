@@ -33,6 +33,8 @@ function findsOf(log, space, time) {
   for (const [id, given] of reviews) {
     if (!found.some((row) => row[0] === id)) rows.push({ space, id, place: given.at(-1)[5], reviews: given, counts: false });
   }
+  const crops = new Map(log.slot('crop', space).events.map((crop) => [crop[3], crop[4]]));
+  for (const row of rows) row.picture = crops.get(row.id);
   return rows.sort((one, other) => one.id - other.id);
 }
 
@@ -177,12 +179,12 @@ export class Reports {
     this.section.hidden = !(finds.length || this.enabled);
     const body = this.section.querySelector('tbody');
     const size = log.isSpatial ? 3 : 2;
-    const shown = finds.map((find) => [find.space, find.id, find.place.slice(0, size).map((value) => number(value)).join(', '), stateOfFind(find), find.counts]);
+    const shown = finds.map((find) => [find.space, find.id, find.place.slice(0, size).map((value) => number(value)).join(', '), stateOfFind(find), find.counts, find.picture]);
     // New rows lose the keyboard focus.
     const key = JSON.stringify([shown, this.enabled]);
     if (body.dataset.key === key) return;
     body.dataset.key = key;
-    body.replaceChildren(...shown.map(([space, id, place, state, counts]) => {
+    body.replaceChildren(...shown.map(([space, id, place, state, counts, picture]) => {
       const row = element('tr', counts ? '' : 'quiet');
       row.dataset.target = id;
       const buttons = element('td', '');
@@ -194,7 +196,14 @@ export class Reports {
           buttons.append(button, ' ');
         }
       }
-      row.append(element('td', '', space ? `${space} ${id}` : String(id)), element('td', '', `(${place}) m`), element('td', 'text', state), buttons);
+      const seen = element('td', '');
+      if (picture) {
+        const image = element('img');
+        image.src = `data:image/jpeg;base64,${picture}`;
+        image.alt = `Target ${id} as its robot saw it`;
+        seen.append(image);
+      }
+      row.append(seen, element('td', '', space ? `${space} ${id}` : String(id)), element('td', '', `(${place}) m`), element('td', 'text', state), buttons);
       return row;
     }));
   }
