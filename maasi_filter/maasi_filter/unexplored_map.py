@@ -20,6 +20,7 @@ from maasi_filter.models.detection import (
     DetectionModel,
     detection_probability_at,
 )
+from maasi_filter.models.line_of_sight import probability_in_sight
 from maasi_filter.models.pose import Pose
 
 # Density samples per cell on each axis, and the number on a whole axis above which a cell
@@ -309,8 +310,14 @@ class UnexploredMap:
         return self._values, self._lower, self._step
 
     def update(self, detection: DetectionModel, pose: Pose) -> None:
-        """Multiply e by 1 - pi for one measurement at `pose` (000, eq. (20))."""
+        """Multiply e by 1 - pi for one measurement at `pose` (000, eq. (20)).
+
+        What terrain hides from there stays unseen.
+        """
         reach = reach_of(detection)
+        if self.area.terrain is not None:
+            self._update_in_sight(detection, pose, reach[0])
+            return
         if math.isinf(reach[0]):
             missed = 1.0 - detection.probability(self._nodes, pose)
             self._values *= missed.reshape(self._values.shape)
@@ -318,6 +325,16 @@ class UnexploredMap:
         turn = pose.position, math.cos(pose.yaw), math.sin(pose.yaw)
         solid = self.dimension == 3
         _update_near(*self.kernel(), detection.kernel(), turn, reach, solid)
+
+    def _update_in_sight(self, detection: DetectionModel, pose: Pose, reach: float) -> None:
+        near = tuple(
+            slice(*np.searchsorted(axis, (at - reach, at + reach + 1e-9)).tolist())
+            for axis, at in zip(self.axes(), pose.position)
+        )
+        values = self.values[near]
+        points = self._nodes.reshape(*self.values.shape, 2)[near].reshape(-1, 2)
+        found = probability_in_sight(detection, points, pose, self.area.terrain)
+        values *= 1.0 - found.reshape(values.shape)
 
     def diffuse(self, variance: float) -> None:
         """Diffuse e for targets in a random walk with `variance` [m^2] and reflecting bounds."""

@@ -57,6 +57,11 @@ class IcPhdFilter(SearchFilter):
         self, settings: FilterSettings, area: Area | ArrayLike, generator: np.random.Generator
     ) -> None:
         super().__init__(settings, area, generator)
+        if self.area.terrain is not None:
+            raise ValueError(
+                "filter.method: read 'ic_phd' with environment.terrain, allowed with it is 'pmb': "
+                'this one would take hidden targets for missed ones'
+            )
         self._numbers: Any = settings.resolved()
         self.particles = np.empty((0, self.dimension))
         self.weights = np.empty(0)

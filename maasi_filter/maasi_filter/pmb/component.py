@@ -12,6 +12,7 @@ from numba import njit
 from maasi_filter.arrays import BoolArray, FloatArray, IntArray
 from maasi_filter.found_targets import SAME_TARGET
 from maasi_filter.geometry.vector_math import normalised, squared_distance
+from maasi_filter.models.line_of_sight import HIDDEN, sight
 from maasi_filter.pmb.association import MANY_PAIRS
 from maasi_filter.pmb.density import Density
 from maasi_filter.pmb.factors import MISS, SCALE, likelihoods, log_factor
@@ -160,6 +161,14 @@ class Component:
         detected = likelihoods(
             scan.head, terms, density.particles, density.weights, probability, seen, sums
         )
+        if scan.terrain is not None:
+            # Particles that the ground hides are hardly detected.
+            weights = density.weights
+            factor = sight(density.particles, scan.pose, scan.terrain, HIDDEN, probability)
+            probability *= factor
+            seen *= factor
+            detected = float(weights @ probability)
+            sums = np.stack([seen @ weights, np.square(seen) @ np.square(weights)])
         view = View(probability, detected, gated, seen, sums[0])
         for k, j in enumerate(gated.tolist()):
             total, squares = sums[:, k]

@@ -7,8 +7,10 @@ import numpy as np
 from numba import njit
 
 from maasi_filter.arrays import BoolArray, FloatArray
+from maasi_filter.geometry.terrain import Terrain
 from maasi_filter.measurement_check import CheckedMeasurement
 from maasi_filter.models.detection import BoxDetection, DetectionModel
+from maasi_filter.models.line_of_sight import HIDDEN, probability_in_sight
 from maasi_filter.models.pose import Pose
 from maasi_filter.pmb.density import Density, fill_moments
 from maasi_filter.pmb.factors import (
@@ -44,6 +46,7 @@ class Scan:
     head: FloatArray  # (HEAD,): Factor of the scan: sensor and its pi; c_0 is 1
     terms: FloatArray  # (m, TERM): Factors of the detections; c_j is 1
     pose: Pose  # Of the sensor
+    terrain: Terrain | None  # Ground that may hide targets
     detection: DetectionModel  # pi
     ranges: FloatArray  # (m,): Metres
     deviations: FloatArray  # (m,): Of the ranges, metres
@@ -128,7 +131,9 @@ def make_scan(
     draws, volume = generator.standard_normal((count, number, d)), np.empty((count, number))
     _place(origins, near, roots, scale, pose.position, exploration.bounds, draws, volume)
     flat = draws.reshape(-1, d)
-    probability = np.minimum(detection.probability(flat, pose), MOST_PROBABLE)
+    terrain = exploration.area.terrain
+    probability = probability_in_sight(detection, flat, pose, terrain, HIDDEN)
+    probability = np.minimum(probability, MOST_PROBABLE)
     volume *= probability.reshape(count, number)
     weights = np.maximum(exploration.at(flat), LEAST_UNEXPLORED).reshape(count, number) * volume
     weights *= exploration.area.density(flat).reshape(count, number)
@@ -140,6 +145,7 @@ def make_scan(
         head,
         terms,
         pose,
+        terrain,
         detection,
         values[:, 0],
         deviations,

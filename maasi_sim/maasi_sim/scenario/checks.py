@@ -41,6 +41,11 @@ def problems_of(scenario: Scenario) -> Problems:
     except ValueError as error:
         yield str(error)
         return
+    if area.terrain is not None and scenario.filter.method == 'ic_phd':
+        yield (
+            "filter.method: read 'ic_phd' with environment.terrain, allowed with it is 'pmb': "
+            'this one would take hidden targets for missed ones'
+        )
     yield from _world_problems(scenario)
     yield from name_problems(scenario)
     yield from event_problems(scenario)
