@@ -107,7 +107,7 @@ def seen_position(rng, robot, pose):
     while True:
         floor = np.append(pose.position[:2] + rng.uniform(-0.3, 0.3, 2), 0.0)
         pixel = model.project(floor[None], pose)[0]
-        if (pixel > 8).all() and (pixel < (model.width - 8, model.height - 8)).all():
+        if (pixel > 30).all() and (pixel < (model.width - 30, model.height - 30)).all():
             return floor
 
 
@@ -127,8 +127,13 @@ def test_a_find_has_the_picture_of_the_measurement_that_completed_it():
     found.append(FoundTarget(2, floor[:2], np.eye(2), 'turtlebot', 1, 5.0))
     maker.add(facts.Found(5.0, '', found, 1))
     maker.add(facts.Found(6.0, '', found, 2))
-    assert [event[:4] for event in events if event[1] == 'crop'] == [[5.0, 'crop', '', 1]]
-    assert next(event[4] for event in events if event[1] == 'crop') == expected
+    assert [event[3:] for event in events if event[1] == 'crop'] == [[1, expected]]
+    # Another robot flies over it later.
+    at = np.append(floor[:2], 1.2)
+    pose = Pose.from_yaw(at, 0.0)
+    seen = facts.Measured(7.0, 'mambo', at, pose, [], None, 9)
+    maker.add(facts.Photographed(7.0, seen, image_of(robot['camera'], floor[None], pose)))
+    assert [event[:4] for event in events if event[1] == 'crop'][1:] == [[7.0, 'crop', '', 2]]
 
 
 @pytest.mark.parametrize('seed', range(6))

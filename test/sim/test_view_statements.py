@@ -84,8 +84,8 @@ def test_found_targets_have_buttons_and_the_map_takes_sightings_and_searched_gro
         shown.open(server.address)
         shown.until("document.querySelectorAll('#finds tr').length == 2")
         assert [row[1:4] for row in rows(shown)] == [
-            ['1', '(20, 30) m', 'found by rover at 2 s'],
-            ['2', '(60, 50) m', 'found by rover at 3 s'],
+            ['1', '(20, 30) m\nrover, 2 s', 'Confirm Reject'],
+            ['2', '(60, 50) m\nrover, 3 s', 'Confirm Reject'],
         ]
         shown.page.fill('#finds input', ' Ann ')
         shown.page.click('#finds tr[data-target="2"] button[data-confirmed=false]')
@@ -147,14 +147,14 @@ def test_a_replay_shows_statements_without_buttons(chromium, tmp_path):
         shown.seek(7.0)
         legend = shown.page.inner_text('#legend')
         assert 'sighting' in legend and 'searched by others' in legend
-        assert [row[3] for row in rows(shown)] == [
-            'rejected',
-            'found by rover at 3 s, confirmed 1 time',
+        assert [row[2] for row in rows(shown)] == [
+            '(20, 30) m\nrejected',
+            '(60, 50) m\nrover, 3 s, confirmed 1 time',
         ]
         assert shown.page.locator('#finds button').count() == 0
         images = shown.page.locator('#finds img')
         assert images.count() == 1
-        assert images.get_attribute('alt') == 'Target 2 as its robot saw it'
+        assert images.get_attribute('alt') == 'Target 2 in the image of a camera'
         assert images.evaluate('(image) => image.decode().then(() => image.naturalWidth)') == 3
         tips = []
         for corner in ([70, 20], [30, 20]):

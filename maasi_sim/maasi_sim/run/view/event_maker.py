@@ -23,6 +23,7 @@ MOVING, UNAVAILABLE, LEFT, SILENT, ENDED = 1, 5, 6, 7, 8
 _SILENCE = 3.0  # a robot is silent after this long without a state, if others send theirs [s]
 _MOST_POINTS = 40  # shown points of a planned path
 _PHOTOGRAPHS = 4  # kept images of a robot
+_MOST_UNSEEN = 100  # found targets that wait for a picture
 _MOST_WAYPOINTS = 400  # shown points of a tour
 
 
@@ -63,6 +64,8 @@ class EventMaker:
         self._modes: dict[str, str] = {}
         # The last images of measurements, by robot.
         self._photographs: dict[str, deque[facts.Photographed]] = {}
+        # Positions of found targets without a picture, by filter and id.
+        self._unseen: dict[tuple[str, int], Sequence[float]] = {}
         self._measured: set[tuple[str, str, int]] = set()
         self.latest = 0.0  #: latest time of an event [s]
 
@@ -202,6 +205,9 @@ class EventMaker:
             return
         kept = self._photographs.setdefault(item.robot, deque(maxlen=_PHOTOGRAPHS))
         kept.append(fact)
+        for team, number in list(self._unseen):
+            if self._add_cut_out(fact, team, number, self._unseen[team, number]):
+                del self._unseen[team, number]
         self._put(fact.time, 'picture', item.robot, *content)
 
     def _robot(self, name: str) -> dict[str, Any]:
@@ -226,25 +232,34 @@ class EventMaker:
             rows.append([item.id, *position, _upper(item.covariance), item.robot, when])
             if item.id not in before:
                 self._say(time, item.robot, 'found', f'target {item.id} at {point(position)} m')
-                self._add_cut_out(time, team, item, position)
+                self._find_picture(team, item, position)
         self._board.found[team] = targets
         self._put(time, 'found', team, rows)
         self._score(time)
 
-    def _add_cut_out(
-        self, time: float, team: str, target: FoundTarget, position: Sequence[float]
-    ) -> None:
-        """Add the part of an image of its finder that shows a target, if there is one."""
-        photographs = self._photographs.get(target.robot, ())
+    def _find_picture(self, team: str, target: FoundTarget, position: Sequence[float]) -> None:
+        """Add the part of an image that shows a target, of its finder or else of a later image."""
+        kept = self._photographs.get(target.robot, ())
         # First the measurement of the find, then the newest.
-        own = [item for item in photographs if item.measured.index == target.measurement]
-        for fact in (*own, *reversed(photographs)):
-            pose = fact.measured.pose
-            assert pose is not None
-            data = cut_out(fact.image, self._robot(target.robot), pose, position)
-            if data is not None:
-                self._put(time, 'crop', team, target.id, data)
+        own = [item for item in kept if item.measured.index == target.measurement]
+        for fact in (*own, *reversed(kept)):
+            if self._add_cut_out(fact, team, target.id, position):
                 return
+        if len(self._unseen) < _MOST_UNSEEN:
+            self._unseen[team, target.id] = position
+
+    def _add_cut_out(
+        self, fact: facts.Photographed, team: str, number: int, position: Sequence[float]
+    ) -> bool:
+        item = fact.measured
+        assert item.pose is not None
+        try:
+            data = cut_out(fact.image, self._robot(item.robot), item.pose, position)
+        except ValueError:
+            return False
+        if data is not None:
+            self._put(max(self.latest, fact.time), 'crop', team, number, data)
+        return data is not None
 
     def _add_report(self, fact: facts.Reported) -> None:
         report = fact.report

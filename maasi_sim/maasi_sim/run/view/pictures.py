@@ -108,11 +108,13 @@ def cut_out(message: Any, robot: dict[str, Any], pose: Pose, position: ArrayLike
     middle, edge = model.project(around, pose)
     if not np.isfinite([*middle, *edge]).all():
         return None
+    half = max(_AROUND_TARGET * float(np.linalg.norm(edge - middle)), _LEAST_HALF)
+    limits = np.array([model.width, model.height])
+    # The target itself is in the image.
+    if (middle < 0.5 * half).any() or (middle > limits - 0.5 * half).any():
+        return None
     image = image_to_array(message) if hasattr(message, 'encoding') else decode_image(message)
     limits = np.array(image.shape[1::-1])
-    if not ((middle >= 0.0) & (middle < limits)).all():
-        return None
-    half = max(_AROUND_TARGET * float(np.linalg.norm(edge - middle)), _LEAST_HALF)
     left, top = np.clip(np.floor(middle - half), 0, limits - 1).astype(int)
     right, bottom = np.clip(np.ceil(middle + half), 1, limits).astype(int)
     part = image[top:bottom, left:right]

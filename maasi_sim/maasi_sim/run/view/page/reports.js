@@ -39,7 +39,7 @@ function findsOf(log, space, time) {
 }
 
 function stateOfFind({ counts, reviews, robot, when }) {
-  const words = counts ? [`found by ${robot} at ${Math.round(when)} s`] : ['rejected'];
+  const words = counts ? [`${robot}, ${Math.round(when)} s`] : ['rejected'];
   const confirmed = reviews.filter((report) => report[3] === 'confirmed').length;
   const rejected = reviews.length - confirmed;
   if (confirmed) words.push(`confirmed ${counted(confirmed, 'time')}`);
@@ -196,14 +196,16 @@ export class Reports {
           buttons.append(button, ' ');
         }
       }
+      const where = element('td', 'text', `(${place}) m`);
+      where.append(element('br'), element('span', 'quiet', state));
       const seen = element('td', '');
       if (picture) {
         const image = element('img');
         image.src = `data:image/jpeg;base64,${picture}`;
-        image.alt = `Target ${id} as its robot saw it`;
+        image.alt = `Target ${id} in the image of a camera`;
         seen.append(image);
       }
-      row.append(seen, element('td', '', space ? `${space} ${id}` : String(id)), element('td', '', `(${place}) m`), element('td', 'text', state), buttons);
+      row.append(seen, element('td', '', space ? `${space} ${id}` : String(id)), where, buttons);
       return row;
     }));
   }
