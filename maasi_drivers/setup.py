@@ -40,6 +40,7 @@ setup(
             'turtlebot_driver = maasi_drivers_entry:turtlebot_driver',
             'plugin_driver = maasi_drivers_entry:plugin_driver',
             'ranging_driver = maasi_drivers_entry:ranging_driver',
+            'camera_driver = maasi_drivers_entry:camera_driver',
             'measurement_feed_sender = maasi_drivers_entry:measurement_feed_sender',
             'mavlink_driver = maasi_drivers_entry:mavlink_driver',
             'mavlink_camera_driver = maasi_drivers_entry:mavlink_camera_driver',

@@ -31,6 +31,8 @@ _CLASSES = {
     'mambo_ble': 'mambo.mambo_robot_link:MamboRobotLink',
     'mambo_feed': 'mambo.onboard_link:OnboardLink',
     'mavlink': 'mavlink.mavlink_robot_link:MavlinkRobotLink',
+    'crazyswarm2': 'crazyswarm_link:CrazyswarmLink',
+    'aerostack2': 'aerostack_link:AerostackLink',
 }
 
 
@@ -66,8 +68,15 @@ class MavlinkCameraDriver(AgentDriver):
         super().__init__(_links('mavlink_camera_driver'), CameraInput, **options)
 
 
+class CameraDriver(AgentDriver):
+    """A robot with a camera; see `TopicLink`, `PlatformLink` and `CameraInput`."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(_links('camera_driver'), CameraInput, **options)
+
+
 class RangingDriver(AgentDriver):
-    """A robot with topics and a ranging sensor; see `TopicLink` and `RangingInput`."""
+    """A robot with a ranging sensor; see `TopicLink`, `PlatformLink` and `RangingInput`."""
 
     def __init__(self, **options: Any) -> None:
         super().__init__(_links('ranging_driver'), RangingInput, **options)
@@ -89,4 +98,5 @@ mambo_onboard_driver = partial(run, MamboOnboardDriver)
 mavlink_driver = partial(run, MavlinkDriver)
 mavlink_camera_driver = partial(run, MavlinkCameraDriver)
 ranging_driver = partial(run, RangingDriver)
+camera_driver = partial(run, CameraDriver)
 turtlebot_driver = partial(run, TurtlebotDriver)

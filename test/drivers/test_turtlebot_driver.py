@@ -1,18 +1,12 @@
 """What only the ground robot's driver does: the laser scan, and Nav2."""
 
-import hashlib
-import json
 import math
-import os
-import queue
-import subprocess
 import sys
-import threading
-from pathlib import Path
 
 import numpy as np
 import pytest
 from action_msgs.msg import GoalStatus
+from interfaces import played, with_interfaces
 from numpy.testing import assert_allclose, assert_array_equal
 from robot_team import NANOSECONDS, STEP, TURTLEBOT, parameters_of, stamped
 from sensor_msgs.msg import LaserScan
@@ -25,7 +19,6 @@ from maasi_msgs.msg import AgentState
 from maasi_sim.simulation.sensors import LaserScanner, LaserSettings
 from maasi_sim.simulation.sim_topics import scan_message
 
-HERE = Path(__file__).parent
 SCANNING = {'scan': {'timeout': 1.0, 'blocked_timeout': 3.0}}
 
 
@@ -93,54 +86,15 @@ def test_a_waypoint_that_cannot_be_reached_is_given_up(play):
 
 @pytest.fixture(scope='module')
 def with_nav2(request):
-    """Return an environment with nav2_msgs: Nav2's own, or that of this folder, built once."""
-    probe = [sys.executable, '-c', 'from nav2_msgs.action import NavigateToPose']
-    if subprocess.run(probe, capture_output=True, check=False).returncode == 0:
-        return os.environ.copy()
-    source = HERE / 'nav2_msgs'
-    content = b''.join(path.read_bytes() for path in sorted(source.rglob('*')) if path.is_file())
-    key = hashlib.sha256(content + sys.version.encode()).hexdigest()[:12]
-    folder = Path(request.config.cache.mkdir('maasi_interfaces')) / f'nav2_msgs_{key}'
-    install = folder / 'install'
-    if not (folder / 'built').exists():
-        command = [sys.executable, '-m', 'colcon', '--log-base', str(folder / 'log'), 'build']
-        command += ['--base-paths', str(source), '--merge-install']
-        command += ['--build-base', str(folder / 'build'), '--install-base', str(install)]
-        command += ['--cmake-args', f'-DPython3_EXECUTABLE={sys.executable}']
-        command += ['-DCMAKE_BUILD_TYPE=Debug', '-DBUILD_TESTING=OFF', '--no-warn-unused-cli']
-        built = subprocess.run(command, capture_output=True, text=True, check=False)
-        assert built.returncode == 0, built.stdout + built.stderr
-        (folder / 'built').touch()
-    environment = os.environ.copy()
-    python = next(install.glob('lib/python*/site-packages'))
-    for name, path in (
-        ('AMENT_PREFIX_PATH', install),
-        ('LD_LIBRARY_PATH', install / 'lib'),
-        ('PYTHONPATH', python),
-    ):
-        environment[name] = f'{path}{os.pathsep}{environment.get(name, "")}'.rstrip(os.pathsep)
-    return environment
+    """Return an environment with nav2_msgs."""
+    return with_interfaces('nav2_msgs', request.config.cache)
 
 
 @pytest.fixture
 def nav2(context, with_nav2):
     """Start what plays Nav2; return a queue of what it says, and its process."""
-    environment = with_nav2 | {
-        name: os.environ[name] for name in ('ROS_DOMAIN_ID', 'ROS_AUTOMATIC_DISCOVERY_RANGE')
-    }
-    command = [sys.executable, str(HERE / 'play_nav2.py')]
-    process = subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True)
-    said = queue.Queue()
-
-    reader = threading.Thread(
-        target=lambda: [said.put(json.loads(line)) for line in process.stdout], daemon=True
-    )
-    reader.start()
-    assert said.get(timeout=60.0)['event'] == 'ready'
-    yield said, process
-    process.kill()
-    process.wait()
-    reader.join()
+    with played(with_nav2, 'play_nav2.py') as made:
+        yield made
 
 
 @pytest.fixture

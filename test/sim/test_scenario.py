@@ -254,6 +254,22 @@ def test_a_robot_may_be_moved_by_another_program(load):
         scenario.check_pace(True, None)
 
 
+def test_a_drone_may_be_flown_by_another_system(load):
+    platform = {'namespace': 'cf7', 'arm': True}
+    linked = PLAIN['robots']['mambo'] | {'link': 'crazyswarm2', 'driver': 'camera_driver'}
+    scenario = load(changed(('robots.mambo', linked | {'platform': platform})))
+    mambo = scenario.robots['mambo']
+    assert mambo.external and not mambo.takes_off and not scenario.external_clock
+    for wrong, words in (
+        (None, r'mambo\.platform: is missing, .* \{arm: true, namespace: '),
+        (platform | {'arm': False}, r'mambo\.platform\.arm: read false'),
+        (platform | {'namespace': 'mambo'}, r"platform\.namespace: read 'mambo', the name of the"),
+        (platform | {'voltages': [4.2, 3.7]}, r'platform'),
+    ):
+        with pytest.raises(ScenarioError, match=words):
+            load(changed(('robots.mambo', linked | {'platform': wrong})))
+
+
 def test_a_drone_with_a_camera_may_be_linked_by_mavlink(load):
     robot = ('robots.mambo', PLAIN['robots']['mambo'] | LINKED)
     driver = ('robots.mambo.driver', 'mavlink_camera_driver')

@@ -9,6 +9,7 @@ from maasi_drivers.settings.vehicles import FlightSettings
 from maasi_filter.arrays import FloatArray
 from maasi_filter.geometry.area import Area
 from maasi_filter.geometry.operating_volume import OperatingVolume
+from maasi_planner.motion import MotionModel
 from maasi_planner.settings import RobotModel
 from maasi_planner.terrain_frame import least_height
 
@@ -103,3 +104,18 @@ def flight_volume(area: Area, robot: RobotModel, flight: FlightSettings) -> Oper
         limits[2, 0] = max(limits[2, 0], ground + least_height(robot))
         limits[2, 1] += area.terrain.surface.highest - area.terrain.surface.lowest
     return OperatingVolume(area, radius, limits)
+
+
+def free_length(
+    motion: MotionModel, position: FloatArray, direction: FloatArray, longest: float
+) -> float:
+    """Return the length of a straight path, at most `longest` [m], that is clear of all zones."""
+    keep_out = motion.keep_out
+    if not len(keep_out):
+        return longest
+    # No zone is thinner, as the robot's radius surrounds it.
+    step = longest / math.ceil(longest / max(keep_out.radius, 0.1))
+    free = 0.0
+    while free < longest - 1e-6 and keep_out.is_free(position + (free + step) * direction):
+        free += step
+    return free

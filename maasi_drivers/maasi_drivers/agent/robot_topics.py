@@ -88,22 +88,30 @@ class OdometryTopic:
 
 
 class PoseTopic:
-    """Poses in the map on `pose`, from motion capture, SLAM or another localiser."""
+    """Poses in the map on `pose`, from motion capture, SLAM or another localiser.
+
+    `frame`: the name of the map in them; default: the driver's.
+    """
 
     def __init__(
-        self, node: LockstepLifecycleNode[DriverSettings], on_pose: Callable[[int, Pose], None]
+        self,
+        node: LockstepLifecycleNode[DriverSettings],
+        on_pose: Callable[[int, Pose], None],
+        topic: str = 'pose',
+        frame: str = '',
     ) -> None:
         self._node, self._on_pose = node, on_pose
-        node.create_subscription(PoseStamped, 'pose', self._receive, sensor_reader(False))
+        self._topic, self._frame = topic, frame or node.settings.frame
+        node.create_subscription(PoseStamped, topic, self._receive, sensor_reader(False))
 
     def _receive(self, message: PoseStamped) -> None:
-        frame, wanted = message.header.frame_id.strip('/'), self._node.settings.frame
+        frame, wanted = message.header.frame_id.strip('/'), self._frame
         try:
             if frame != wanted:
                 raise ValueError(f'header.frame_id: read {frame!r}, allowed is {wanted!r}')
             pose = pose_from_ros(message.pose)
         except ValueError as error:
-            self._node.drop('pose', f'pose: {error}')
+            self._node.drop('pose', f'{self._topic}: {error}')
             return
         self._on_pose(stamp_from_ros(message.header.stamp), pose)
 
@@ -122,12 +130,12 @@ def charge_of(percentage: float, unit: BatteryUnit) -> float:
 class BatteryTopic:
     """Passes charges on `battery_state` to `driver.take_charge`."""
 
-    def __init__(self, driver: RobotNode) -> None:
+    def __init__(self, driver: RobotNode, topic: str = 'battery_state') -> None:
         self._driver = driver
         # In lockstep: stamp [ns] and reading.
         self._waiting: list[tuple[int, float]] = []
         self._subscription = driver.create_subscription(
-            BatteryState, 'battery_state', self._on_battery, sensor_reader(driver.settings.lockstep)
+            BatteryState, topic, self._on_battery, sensor_reader(driver.settings.lockstep)
         )
 
     def _on_battery(self, message: BatteryState) -> None:

@@ -7,7 +7,7 @@ from typing import Annotated, ClassVar, Literal
 from pydantic import Field, model_validator
 
 from maasi_drivers.settings.camera import CameraSettings
-from maasi_drivers.settings.vehicles import MamboSettings, MavlinkSettings
+from maasi_drivers.settings.vehicles import MamboSettings, MavlinkSettings, PlatformSettings
 from maasi_filter.geometry.environment import EnvironmentSettings
 from maasi_filter.plugins import PluginGroup
 from maasi_filter.ros.node_settings import LIVELINESS_LEASE, NodeSettings
@@ -23,12 +23,14 @@ CommandType = Annotated[
     ),
 ]
 
+PLATFORM_LINKS = ('crazyswarm2', 'aerostack2')  # to systems that fly a drone by themselves
 # Links that each driver of the suite has.
 LINKS: dict[str, tuple[str, ...]] = {
     'mambo_driver': ('topics', 'mambo_wifi', 'mambo_ble'),
     'mambo_onboard_driver': ('mambo_feed',),
     'turtlebot_driver': ('topics',),
-    'ranging_driver': ('topics',),
+    'ranging_driver': ('topics', *PLATFORM_LINKS),
+    'camera_driver': ('topics', *PLATFORM_LINKS),
     'mavlink_driver': ('topics', 'mavlink'),
     'mavlink_camera_driver': ('topics', 'mavlink'),
 }
@@ -88,10 +90,13 @@ class ScanSettings(Settings):
 class DrivenRobot(RobotModel):
     """Settings of a robot that driver and simulation share."""
 
-    link: Literal['topics', 'mambo_wifi', 'mambo_ble', 'mambo_feed', 'mavlink'] = Field(
+    link: Literal[
+        'topics', 'mambo_wifi', 'mambo_ble', 'mambo_feed', 'mavlink', 'crazyswarm2', 'aerostack2'
+    ] = Field(
         'topics',
         description='Connection: ROS topics; pyparrot over WiFi or Bluetooth (mambo_driver); its '
-        'own program by UDP (mambo_onboard_driver); MAVLink (mavlink_driver)',
+        'own program by UDP (mambo_onboard_driver); MAVLink (mavlink_driver); the services of '
+        'crazyswarm2 or the behaviors of Aerostack2 (ranging_driver, camera_driver)',
     )
     mambo: MamboSettings | None = Field(
         None,
@@ -100,6 +105,9 @@ class DrivenRobot(RobotModel):
     )
     mavlink: MavlinkSettings | None = Field(
         None, description='For link mavlink: connection and permissions'
+    )
+    platform: PlatformSettings | None = Field(
+        None, description='For links crazyswarm2 and aerostack2: connection and permissions'
     )
     yaw: Finite = Field(0.0, description='Heading at the start, from the x axis of the map [rad]')
     camera: CameraSettings | None = Field(None, description='Its camera; default: a ranging sensor')

@@ -1,4 +1,4 @@
-"""Settings of the links to a Parrot Mambo and to a vehicle that speaks MAVLink."""
+"""Settings of the links to vehicles that take off."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from maasi_filter.arrays import FloatArray
-from maasi_filter.settings import Finite, Intervals, Settings
+from maasi_filter.settings import Finite, Intervals, Settings, Vector2
 
 # Largest tilt setting of a Mambo [rad].
 LEAST_TILT, MOST_TILT = math.radians(5.0), math.radians(25.0)
@@ -202,4 +202,39 @@ class MavlinkSettings(FlightSettings):
             raise ValueError(
                 f'own_system: got {self.own_system}, allowed is another one than of the vehicle'
             )
+        return self
+
+
+class PlatformSettings(FlightSettings):
+    """Connection and permissions of a drone that another system flies."""
+
+    namespace: str = Field(
+        min_length=1,
+        description='Namespace of its services and topics: the name of the Crazyflie in '
+        "crazyswarm2, or of the drone in Aerostack2; another one than the robot's",
+    )
+    frame: str = Field(
+        '',
+        description='header.frame_id of its poses, which are map poses. Default: world with link '
+        'crazyswarm2, earth with link aerostack2',
+    )
+    climb: float = Field(
+        0.5, gt=0.0, le=5.0, description='Vertical speed of take-off and landing [m/s]'
+    )
+    lead: float = Field(
+        1.0,
+        ge=0.4,
+        le=5.0,
+        description='Flight time to the positions that it is sent to: without another one it '
+        'stops there [s]',
+    )
+    voltages: Vector2 = Field(
+        [3.7, 4.2],
+        description='Battery voltages of a charge of 0 and of 1, with link crazyswarm2 [V]',
+    )
+
+    @model_validator(mode='after')
+    def _rising(self) -> PlatformSettings:
+        if self.voltages[0] >= self.voltages[1]:
+            raise ValueError(f'voltages: got {self.voltages}, allowed is the lower one first')
         return self

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from maasi_drivers.settings.driver import DRIVERS, LINKS, TERRAIN_LINKS
-from maasi_drivers.settings.vehicles import MamboSettings
+from maasi_drivers.settings.vehicles import MamboSettings, MavlinkSettings, PlatformSettings
 from maasi_filter.geometry.area import Area
 from maasi_filter.geometry.environment import EnvironmentSettings
 from maasi_filter.plugins import unknown
@@ -57,7 +57,7 @@ def problems_of(scenario: Scenario) -> Problems:
             _free_space_problems(robot, area),
             _sensor_problems(robot, scenario),
             _simulated_problems(robot, scenario),
-            _link_problems(robot),
+            _link_problems(name, robot),
             _terrain_problems(robot, area),
         ):
             yield from (f'robots.{name}.{problem}' for problem in problems)
@@ -228,11 +228,11 @@ def _sensor_problems(robot: RobotSettings, scenario: Scenario) -> Problems:
         yield f"camera: is missing, driver '{robot.driver}' needs it"
 
 
-def _link_problems(robot: RobotSettings) -> Problems:
+def _link_problems(name: str, robot: RobotSettings) -> Problems:
     if robot.link == 'topics':
         return
-    link = robot.mambo if robot.link == 'mambo_wifi' else robot.mavlink
-    key = robot.link.removesuffix('_wifi')
+    links = {'mambo_wifi': ('mambo', robot.mambo), 'mavlink': ('mavlink', robot.mavlink)}
+    key, link = links.get(robot.link, ('platform', robot.platform))
     drivers = [driver for driver, links in LINKS.items() if robot.link in links]
     if robot.body == 'external':
         yield f"body: read 'external', allowed with link {robot.link} is simulated"
@@ -247,9 +247,18 @@ def _link_problems(robot: RobotSettings) -> Problems:
             'timeout'
         )
     if link is None:
-        least = '{arm: true}' if key == 'mavlink' else '{arm: true, full_speed: ...}'
+        least = {
+            'mavlink': '{arm: true}',
+            'mambo': '{arm: true, full_speed: ...}',
+            'platform': '{arm: true, namespace: ...}',
+        }[key]
         yield f'{key}: is missing, link {robot.link} needs it: at least {least}'
         return
+    if isinstance(link, PlatformSettings) and link.namespace.strip('/') == name:
+        yield (
+            f"platform.namespace: read '{link.namespace}', the name of the robot; allowed is "
+            'another one, as both have services of the same names'
+        )
     if not link.arm:
         yield f'{key}.arm: read false, allowed is true: otherwise it never takes off'
     height, submarine = robot.start[2], getattr(link, 'vehicle', '') == 'submarine'
@@ -264,7 +273,7 @@ def _link_problems(robot: RobotSettings) -> Problems:
             'measures it'
         if link.pose != 'events':
             yield f"mambo.pose: read '{link.pose}', allowed in simulation is 'events'"
-    elif not robot.external:
+    elif isinstance(link, MavlinkSettings) and not robot.external:
         if not _MAVLINK_URL.match(link.url):
             yield (
                 f"mavlink.url: read '{link.url}', allowed is udpin:HOST:PORT, as the vehicle is "

@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field
 
-from maasi_drivers.settings.driver import DRIVERS, DrivenRobot
+from maasi_drivers.settings.driver import DRIVERS, PLATFORM_LINKS, DrivenRobot
 from maasi_filter.arrays import FloatArray
 from maasi_filter.models.sensor import Sensor
 from maasi_filter.settings import (
@@ -145,8 +145,10 @@ class RobotSettings(DrivenRobot, PlannedRobotSettings):
         description='With link topics: simulated, or external: moved by another program such as '
         'Gazebo, which publishes its odometry and /clock',
     )
-    link: Literal['topics', 'mambo_wifi', 'mavlink'] = Field(
-        'topics', description='Connection of its driver; the robot side is simulated'
+    link: Literal['topics', 'mambo_wifi', 'mavlink', 'crazyswarm2', 'aerostack2'] = Field(
+        'topics',
+        description='Connection of its driver; the robot side is simulated, with crazyswarm2 and '
+        'aerostack2 another program',
     )
     autopilot: AutopilotSettings = Field(
         default_factory=AutopilotSettings,
@@ -172,7 +174,7 @@ class RobotSettings(DrivenRobot, PlannedRobotSettings):
         """Whether another program than the sim moves it."""
         if self.link == 'mavlink':
             return self.autopilot.external
-        return self.body == 'external'
+        return self.body == 'external' or self.link in PLATFORM_LINKS
 
     @property
     def measuring_period(self) -> float:

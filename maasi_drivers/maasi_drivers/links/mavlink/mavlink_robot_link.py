@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from maasi_drivers.agent.flight_rules import HomeLanding, flight_volume
+from maasi_drivers.agent.flight_rules import HomeLanding, flight_volume, free_length
 from maasi_drivers.agent.odometry import PoseHistory, StampedPose
 from maasi_drivers.agent.robot_node import BATTERY, ODOMETRY, RobotNode
 from maasi_drivers.agent.waypoint_follower import Goal, GoalStatus
@@ -152,7 +152,9 @@ class MavlinkRobotLink(RobotLink):
         if away <= min(lead, least) and straight:
             return to_target
         # Without another command the vehicle continues to this point.
-        lead = max(self._free(position, velocity / speed, min(lead, away)), min(least, lead))
+        motion = self.driver.follower.motion
+        free = free_length(motion, position, velocity / speed, min(lead, away))
+        lead = max(free, min(least, lead))
         if away <= lead and straight:
             return to_target
         offset = velocity * (lead / speed)
@@ -167,18 +169,6 @@ class MavlinkRobotLink(RobotLink):
         if terrain is None:
             return True
         return terrain.clearance(position, position + offset) >= least_height(self.driver.settings)
-
-    def _free(self, position: FloatArray, direction: FloatArray, lead: float) -> float:
-        """Return the length of a straight path, at most `lead` [m], that is clear of all zones."""
-        keep_out = self.driver.follower.motion.keep_out
-        if not len(keep_out):
-            return lead
-        # No zone is thinner, as the robot's radius surrounds it.
-        step = lead / math.ceil(lead / max(keep_out.radius, 0.1))
-        free = 0.0
-        while free < lead - 1e-6 and keep_out.is_free(position + (free + step) * direction):
-            free += step
-        return free
 
     def hold(self) -> None:
         """Stop the vehicle now; with the next pose it holds its position."""

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from rosbags.typesys.store import Typestore
 
-from maasi_drivers.settings.driver import DRIVERS, DrivenRobot, DriverSettings
+from maasi_drivers.settings.driver import DRIVERS, PLATFORM_LINKS, DrivenRobot, DriverSettings
 from maasi_filter.ros.node_settings import FilterNodeSettings
 from maasi_filter.ros.parameters import flatten
 from maasi_filter.settings import unsuitable_lengths, unused_settings
@@ -180,6 +180,7 @@ def _robot_plans(
             **({'tf_rate': _LOCKSTEP_TF_RATE} if common['lockstep'] else {}),
             'mambo': robot.mambo if robot.link == 'mambo_wifi' else None,
             'mavlink': robot.mavlink if robot.link == 'mavlink' else None,
+            'platform': robot.platform if robot.link in PLATFORM_LINKS else None,
         }
     )
     own = name in scenario.namespaces()

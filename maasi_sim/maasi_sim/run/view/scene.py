@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 from shapely.geometry.base import BaseGeometry
 
 from maasi_drivers.agent.flight_rules import flight_volume
-from maasi_drivers.settings.vehicles import MamboSettings, MavlinkSettings
+from maasi_drivers.settings.vehicles import FlightSettings
 from maasi_filter.geometry.area import Area
 from maasi_filter.settings import DETECTIONS
 from maasi_filter.unexplored_map import UnexploredMap
@@ -148,8 +148,8 @@ def _robot(robot: RobotSettings, scenario: Scenario) -> dict[str, Any]:
     fence = {}
     if robot.link != 'topics':
         # As its driver creates it.
-        flies = robot.link == 'mambo_wifi'
-        limits = robot.mambo or MamboSettings() if flies else robot.mavlink or MavlinkSettings()
+        links = {'mambo_wifi': robot.mambo, 'mavlink': robot.mavlink}
+        limits = links.get(robot.link, robot.platform) or FlightSettings()
         volume = flight_volume(Area(scenario.environment.bounds), robot, limits)
         fence = {'fence': rounded(volume.limits)}
     return {
