@@ -23,7 +23,7 @@ from maasi_sim.run.view.page_file import write_replay
 from maasi_sim.run.view.report_request import ReportRequest, read_report
 from maasi_sim.run.view.server import Hub, ViewServer
 
-SCENE = {'name': 'test', 'robots': {}, 'bounds': [[0, 100], [0, 80]]}
+SCENE = {'name': 'test', 'robots': {}, 'bounds': [[0, 100], [0, 80]], 'expected_targets': 6.0}
 FOUND = [[1, 20.0, 30.0, 0.0, [1, 0, 0, 1, 0, 0], 'rover', 2.0]]
 FOUND += [[2, 60.0, 50.0, 0.0, [1, 0, 0, 1, 0, 0], 'rover', 3.0]]
 EVENTS = [
@@ -152,6 +152,9 @@ def test_a_replay_shows_statements_without_buttons(chromium, tmp_path):
             '(60, 50) m\nrover, 3 s, confirmed 1 time',
         ]
         assert shown.page.locator('#finds button').count() == 0
+        # N0 grows by the sighting.
+        expected = [shown.page.evaluate(f'maasi.log.expected({time})') for time in (3.5, 4.0)]
+        assert expected == [6.0, 6.5]
         images = shown.page.locator('#finds img')
         assert images.count() == 1
         assert images.get_attribute('alt') == 'Target 2 in the image of a camera'

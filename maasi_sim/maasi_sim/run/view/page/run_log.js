@@ -176,10 +176,20 @@ export class RunLog {
     this.expect(time);
   }
 
+  // N0 with the sightings of persons, which each of several filters may count.
+  expected(time) {
+    const sums = this.owners('report').map((space) => {
+      const slot = this.slot('report', space);
+      const counted = slot.events.slice(0, slot.count(time));
+      return counted.reduce((sum, event) => (event[3] === 'cleared' ? 0 : sum + (event[3] === 'sighting' ? event[7] : 0)), 0);
+    });
+    return this.scene.expected_targets + Math.max(0, ...sums);
+  }
+
   // Expected number left: potential targets, and N0 times the unexplored share.
   expect(time) {
     const unseen = 1 - (this.explored.at(time) || 0);
-    if (this.knowsExpected) this.left.add(time, (this.potential.at(time) || 0) + this.scene.expected_targets * unseen);
+    if (this.knowsExpected) this.left.add(time, (this.potential.at(time) || 0) + this.expected(time) * unseen);
   }
 
   get knowsExpected() {
