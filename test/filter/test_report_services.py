@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from test_filter_node import running
 
+from maasi_filter.records import FoundTarget
 from maasi_filter.ros.qos import LATCHED_ALL
 from maasi_msgs.msg import Report
 from maasi_msgs.srv import AddSighting, MarkSearched, ReviewTarget
@@ -94,6 +95,29 @@ def test_statements_survive_a_restart(tmp_path, method):
         np.testing.assert_array_equal(team.tested.filter.area.cells, cells)
         assert ask(team, 'mark_searched', **SEARCHED).success
         team.until(lambda: reports[-1].id == 3)
+
+
+def test_a_target_of_another_filter_is_reviewed_there():
+    with running() as team:
+        theirs = FoundTarget(4, np.array([1.5, 1.5]), 1e-4 * np.eye(2), 'rover', 2, 0.1)
+        team.tested.filter.merge({'rover': [theirs]})
+        (target,) = team.tested.filter.found_targets
+        answer = ask(team, 'review_target', id=target.id, confirmed=False)
+        assert not answer.success
+        assert answer.message.startswith(f'id: read {target.id}, which rover found: allowed are')
+        assert team.tested.filter.found_targets == [target]
+
+
+def test_in_lockstep_a_target_that_is_withdrawn_before_its_batch_is_dropped_by_name():
+    with running(lockstep=True) as team:
+        team.see(*range(1, 9))
+        first = ids(team)[0]
+        answer = ask(team, 'review_target', id=first, confirmed=True, step=10)
+        assert answer.success
+        search = team.tested.filter
+        search.components = [item for item in search.components if item.target is None]
+        assert team.step(10, {'a': []}).reports == 0
+        assert team.tested.dropped['bad statement'] == 1
 
 
 def test_in_lockstep_statements_wait_for_their_batch_and_runs_are_equal():
