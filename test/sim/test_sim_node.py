@@ -409,6 +409,19 @@ def test_a_linked_robot_is_cut_off_while_it_is_away(make_team, tmp_path):
         link.close()
 
 
+@pytest.mark.parametrize('external', [False, True])
+def test_images_of_another_program_are_not_simulated(make_team, external):
+    content = deepcopy(SCENARIO)
+    robot = content['robots']['turtlebot'] | ({'measurements': 'external'} if external else {})
+    content['robots'] = {'turtlebot': robot}
+    team = make_team(content, robots=('turtlebot',), lockstep=False, rate=1.0)
+    robot = team.drivers['turtlebot']
+    team.spin_until(lambda: len(robot.of('odom')) > 40)
+    assert bool(robot.of('camera/image_raw')) is not external
+    for topic in ('camera/image_raw', 'camera/camera_info'):
+        assert len(robot.get_publishers_info_by_topic(f'/turtlebot/{topic}')) == (not external)
+
+
 def test_a_robot_that_another_program_moves_brings_its_own_time(make_team):
     content = deepcopy(SCENARIO)
     content['robots'] = {'turtlebot': content['robots']['turtlebot'] | {'body': 'external'}}

@@ -22,16 +22,9 @@ class FlightSettings(Settings):
         False,
         description='Permit take-off, once per call of the service arm',
     )
-    arm_timeout: float = Field(
-        60.0,
-        gt=0.0,
-        description='Time after the service arm within which it must take off or be armed; then a '
-        'new call is needed [s]',
-    )
     ground: Finite = Field(
         0.0, description='Map height of the ground or water surface at its start [m]'
     )
-    latency: float = Field(0.0, ge=0.0, le=1.0, description='Delay of positions [s]')
     geofence: Intervals | None = Field(
         None,
         min_length=3,
@@ -42,7 +35,19 @@ class FlightSettings(Settings):
     )
 
 
-class MamboSettings(FlightSettings):
+class DelayedFlightSettings(FlightSettings):
+    """The same for vehicles that take off when they are ready, and report positions late."""
+
+    arm_timeout: float = Field(
+        60.0,
+        gt=0.0,
+        description='Time after the service arm within which it must take off or be armed; then a '
+        'new call is needed [s]',
+    )
+    latency: float = Field(0.0, ge=0.0, le=1.0, description='Delay of positions [s]')
+
+
+class MamboSettings(DelayedFlightSettings):
     """Connection and permissions of a Mambo."""
 
     address: str = Field(
@@ -121,7 +126,7 @@ class MamboSettings(FlightSettings):
 Ending = Literal['hold', 'land']
 
 
-class MavlinkSettings(FlightSettings):
+class MavlinkSettings(DelayedFlightSettings):
     """Connection and permissions of an autopilot."""
 
     url: str = Field(

@@ -52,6 +52,7 @@ class Options:
     listing: bool = False
     view: ViewOptions | None = None
     cot: CotAddress | None = None
+    write_world: Path | None = None
 
     def overrides(self) -> dict[str, tuple[Key, Any]]:
         """Return what wins over the values of the scenario file: by option, key and value."""
@@ -160,6 +161,13 @@ def build_parser() -> argparse.ArgumentParser:
         help='send found targets as Cursor-on-Target events to a TAK server, or to a multicast '
         'group such as udp://239.2.3.1:6969; needs environment.origin',
     )
+    add(
+        '--write-world',
+        type=Path,
+        metavar='FILE.sdf',
+        help='write the scenario as a world of Gazebo and, next to it, the configuration of '
+        'ros_gz_bridge, and exit',
+    )
     add('--view', action='store_true', help='show the run in a browser')
     add_view_options(parser)
     return parser
@@ -218,6 +226,10 @@ def parse(arguments: list[str] | None) -> Options:
     options = Options(**given)
     if options.listing:
         return options
+    if options.write_world is not None and (
+        options.check or options.replay or options.view or options.write_world.suffix != '.sdf'
+    ):
+        parser.error('--write-world: allowed is FILE.sdf, without --check, --replay and --view')
     if options.check and (options.replay is not None or options.view is not None):
         parser.error('--check: allowed without --replay and --view')
     if options.cot is not None and (options.check or options.replay is not None):

@@ -4,6 +4,7 @@ import contextlib
 import gc
 import os
 import sys
+from pathlib import Path
 
 from maasi_filter.ros import middleware
 from maasi_sim.run.ending import DONE, NOT_WRITTEN, WRONG_INPUT, Interruption
@@ -21,6 +22,8 @@ def main(arguments: list[str] | None = None) -> int:
         return list_scenarios()
     if options.check:
         return check(options)
+    if options.write_world is not None:
+        return write_world(options, options.write_world)
     if middleware.is_missing():
         return WRONG_INPUT
     # Nodes load what they share while this process loads what is its own.
@@ -78,6 +81,36 @@ def check(options: Options) -> int:
         _print_errors(error)
         return WRONG_INPUT
     display.warn(*mission.warning().splitlines())
+    return DONE
+
+
+def write_world(options: Options, world: Path) -> int:
+    """Write the scenario as a world of Gazebo, and return the exit code."""
+    from maasi_sim.run.missions import load_mission
+    from maasi_sim.run.progress import ProgressDisplay
+    from maasi_sim.scenario import gazebo_world
+    from maasi_sim.scenario.layering import ScenarioError
+    from maasi_sim.scenario.schema import Scenario
+
+    display = ProgressDisplay(sys.stdout)
+    try:
+        scenario = load_mission(options.scenario, options.overrides()).scenario
+        if not isinstance(scenario, Scenario):
+            raise ScenarioError(
+                f'{options.scenario}: read a search of buildings; allowed is one for targets'
+            )
+        notes = gazebo_world.write_world(scenario, world)
+    except ScenarioError as error:
+        _print_errors(error)
+        return WRONG_INPUT
+    except OSError as error:
+        print(f'error: --write-world: {world}: {error.strerror}', file=sys.stderr)
+        return NOT_WRITTEN
+    display.warn(*notes)
+    display.say(f'{world} and {gazebo_world.bridge_file(world)}: start them by')
+    display.say(
+        f'ros2 launch maasi_sim gazebo.launch.py world:={world} scenario:={options.scenario}'
+    )
     return DONE
 
 

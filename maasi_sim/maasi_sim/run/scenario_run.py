@@ -44,7 +44,9 @@ from maasi_sim.run.view.live_view import RunPage
 from maasi_sim.run.view.page_file import REPLAY
 from maasi_sim.run.view.scene import scene_of
 from maasi_sim.run.view.view_run import send_replay
+from maasi_sim.scenario.external import external_topics
 from maasi_sim.scenario.layering import ScenarioError, to_yaml
+from maasi_sim.scenario.schema import RobotSettings
 
 # Wall time between checks of processes and topics, during the start and afterwards [s].
 _START_POLL, _POLL = 0.02, 0.05
@@ -293,6 +295,9 @@ class RunningRun:
         where = f' --namespace {team}' if team else ''
         domain = self.recorder.context.get_domain_id()
         for name, robot in self.scenario.robots.items():
+            if isinstance(robot, RobotSettings):
+                for topic in external_topics(f'{team}/{name}'.strip('/'), robot):
+                    self.display.say(f'{name}: another program is to {topic}')
             if robot.external and robot.link != 'topics':
                 self.display.say(
                     f'{name} is external; to let it take off: '

@@ -179,7 +179,9 @@ def _simulated_problems(robot: RobotSettings, scenario: Scenario) -> Problems:
                     f'camera: read one, but targets.{field} is {value}; allowed are targets '
                     'without it, or robots without a camera'
                 )
-    if robot.external and robot.simulated != nothing:
+    if robot.measurements == 'external' and robot.simulated != nothing:
+        yield 'simulated: read settings, but its measurements are external; allowed is simulated'
+    elif robot.external and robot.simulated != nothing:
         yield 'simulated: read settings for an external robot; allowed are simulated robots'
 
 

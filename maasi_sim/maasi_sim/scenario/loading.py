@@ -189,6 +189,7 @@ def _with_types(layer: Layer, path: Path) -> Layer:
     robots = _robots(layer)
     # In the order of the file.
     types = [Layer({'robots': {name: {} for name in robots}})]
+    measured = {name: _taken_external(own) for name, own in robots.items()}
     for name, own in robots.items():
         if own.keys() >= RobotSettings.model_fields.keys():
             # From a run: with all layers merged, without files of types.
@@ -199,7 +200,24 @@ def _with_types(layer: Layer, path: Path) -> Layer:
             raise ScenarioError(layer.located(f'robots.{name}.type: {problem}'))
         key: Key = ('robots', name)
         types += [read_layer(files[item], key) for item in ('all', kind) if item in files]
-    return merge(*types, layer)
+    result = merge(*types, layer)
+    for name, key in measured.items():
+        other = 'sensor' if result.data['robots'][name].get('camera') is None else 'camera'
+        if key not in ('', other):
+            problem = f"robots.{name}.{key}: read 'external', but it measures by its {other}"
+            raise ScenarioError(layer.located(f'{problem}; allowed is {other}: external'))
+    return result
+
+
+def _taken_external(own: dict[str, Any]) -> str:
+    """Replace `camera: external` or `sensor: external` by `measurements`; return the key."""
+    for key in ('camera', 'sensor'):
+        if own.get(key) == 'external':
+            # The settings of the type remain.
+            del own[key]
+            own['measurements'] = 'external'
+            return key
+    return ''
 
 
 def _robots(layer: Layer) -> dict[str, dict[str, Any]]:

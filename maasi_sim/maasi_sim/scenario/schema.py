@@ -145,6 +145,11 @@ class RobotSettings(DrivenRobot, PlannedRobotSettings):
         description='With link topics: simulated, or external: moved by another program such as '
         'Gazebo, which publishes its odometry and /clock',
     )
+    measurements: Literal['simulated', 'external'] = Field(
+        'simulated',
+        description='Images of its camera, or ranges of its sensor: simulated, or external: '
+        'published by another program; in a file also camera: external or sensor: external',
+    )
     link: Literal['topics', 'mambo_wifi', 'mavlink', 'crazyswarm2', 'aerostack2'] = Field(
         'topics',
         description='Connection of its driver; the robot side is simulated, with crazyswarm2 and '
@@ -154,7 +159,9 @@ class RobotSettings(DrivenRobot, PlannedRobotSettings):
         default_factory=AutopilotSettings,
         description='With link mavlink: its simulated autopilot; or external: another program',
     )
-    start: Vector3 = Field(description='Position at the start, x y z [m, map]')
+    start: Vector3 = Field(
+        description='Position at the start, x y z; over terrain z is above the ground [m, map]'
+    )
     motion: MotionSettings = Field(description='Motion of the robot')
     sensor: SensorSettings = Field(description='Its sensor, as assumed by the filter')
     laser: LaserSettings | None = Field(None, description='Its laser scanner, if any')
@@ -233,6 +240,11 @@ class Scenario(BaseScenario):
         asked = 'lockstep' if lockstep else f'rate {rate:g}'
         for name in self.names():
             robot = self.robots[name]
+            if robot.measurements == 'external':
+                raise ScenarioError(
+                    f"robots.{name}.measurements: read 'external', which needs real time, but "
+                    f'{asked} is set; allowed is simulated, or rate 1 without lockstep'
+                )
             if robot.link != 'topics':
                 raise ScenarioError(
                     f'robots.{name}.link: read {robot.link!r}, which needs real time, but '

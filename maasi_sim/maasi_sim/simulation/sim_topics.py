@@ -75,13 +75,15 @@ class RobotTopics:
         self.needed: list[str] = []  # : full names of the topics that its driver needs
         if self._odometry_publisher is not None:
             self.needed.append(self._odometry_publisher.topic_name)
-        if self.robot.camera is not None:
+        # Measurements that another program publishes.
+        self._measures = robot.measurements == 'simulated'
+        if self.robot.camera is not None and self._measures:
             assert robot.camera is not None
             self._image_publisher = publisher(Image, 'camera/image_raw')
             self._info_publisher = publisher(CameraInfo, 'camera/camera_info')
             self._image, self._info = camera_messages(robot.camera, f'{name}/camera_optical')
             self.needed.append(self._image_publisher.topic_name)
-        elif self.robot.ranging is not None:
+        elif self.robot.ranging is not None and self._measures:
             self._ranges_publisher = publisher(RangeArray, 'ranges')
             self._ranges = RangeArray(header=Header(frame_id=f'{name}/base_link'))
             self.needed.append(self._ranges_publisher.topic_name)
@@ -95,7 +97,7 @@ class RobotTopics:
     def publish_sensors(self, stamp: Time) -> None:
         """Publish the readings of its sensors and battery in this step."""
         simulation, robot, name = self.simulation, self.robot, self.name
-        imaging = simulation.images_due(name)
+        imaging = self._measures and simulation.images_due(name)
         if imaging and robot.camera is not None:
             image = robot.image(simulation.step, simulation.time)
             self._info.header.stamp = stamp

@@ -41,6 +41,7 @@ class SearchRobotSettings(SearcherSettings):
     # Simulated, and in flight from the start.
     battery_unit: ClassVar[str] = 'fraction'
     external: ClassVar[bool] = False
+    measurements: ClassVar[str] = 'simulated'
     takes_off: ClassVar[bool] = False
 
 
