@@ -44,7 +44,7 @@ PARTS = {
                 f'how_to/{name}'
                 for name in ('robot', 'autopilots', 'detections', 'planner', 'filter')
             ),
-            *('plugins', 'how_to/bags', 'compare', 'view'),
+            *('plugins', 'how_to/other_systems', 'how_to/bags', 'compare', 'view'),
             *('robots', 'robots_mavlink', 'robots_mambo'),
         ],
     ),
