@@ -23,7 +23,10 @@ setup(
         'shapely>=2.0.3',
         'typing_extensions>=4.10',
     ],
-    extras_require={'geo': ['rasterio>=1.4'], 'test': ['hypothesis>=6.98', 'pytest>=7.4']},
+    extras_require={
+        'geo': ['pyogrio>=0.10', 'rasterio>=1.4'],
+        'test': ['hypothesis>=6.98', 'pytest>=7.4'],
+    },
     zip_safe=True,
     maintainer='The MAASI developers',
     maintainer_email='maasi@users.noreply.github.com',

@@ -33,7 +33,7 @@ setup(
     ],
     extras_require={
         'experiments': ['distributed>=2024.1', 'matplotlib>=3.8'],
-        'geo': ['rasterio>=1.4'],
+        'geo': ['maasi_filter[geo]', 'rasterio>=1.4'],
         'reports': ['matplotlib>=3.8', 'Pillow>=10.2'],
         'runs': ['matplotlib>=3.8', 'setproctitle>=1.3.3'],
         'test': ['pytest>=7.4'],

@@ -244,8 +244,8 @@ def test_archives_and_files_without_end_are_refused(tmp_path):
     written(tmp_path, 'big.poly', '1 2\n' * 6_000_000)
     assert 'is too large' in refusal(tmp_path / 'big.poly')
     assert 'No such file' in refusal(tmp_path / 'gone.gpx')
-    with pytest.raises(ValidationError, match=r'read field\.shp, .*\.kml.*ogr2ogr'):
-        environment(tmp_path / 'field.shp')
+    with pytest.raises(ValidationError, match=r'read field\.dxf, .*\.kml.*ogr2ogr'):
+        environment(tmp_path / 'field.dxf')
 
 
 def test_an_upload_with_the_name_of_a_file_is_not_read(tmp_path, monkeypatch):

@@ -15,7 +15,7 @@ PACKAGES = ('config', 'maasi_filter', 'maasi_planner', 'maasi_drivers', 'maasi_s
 BLOCKED = (
     *('ament_index_python', 'builtin_interfaces', 'geometry_msgs', 'maasi_msgs', 'rclpy'),
     *('std_msgs', 'distributed', 'matplotlib', 'PIL', 'pymavlink', 'pyparrot'),
-    *('rasterio', 'setproctitle'),
+    *('pyogrio', 'rasterio', 'setproctitle'),
 )
 BLOCK = 'raise ModuleNotFoundError("No module named " + repr(__name__), name=__name__)\n'
 

@@ -157,7 +157,8 @@ class EnvironmentSettings(Settings):
     area: Shape | None = Field(
         None,
         description='Polygons in place of bounds: corners or rings [m, map], GeoJSON, or a file: '
-        '.geojson, .kml, .kmz, .gpx, .plan, .waypoints, .poly; stored as well-known text',
+        '.geojson, .kml, .kmz, .gpx, .plan, .waypoints, .poly, .shp, .gpkg; stored as well-known '
+        'text',
     )
     altitude: Vector2 | None = Field(
         None, description='With area: lowest and highest z of targets; default: 2D [m]'

@@ -19,8 +19,9 @@ from maasi_filter.arrays import FloatArray
 from maasi_filter.geometry.geodesy import OriginSettings, to_map
 from maasi_filter.geometry.map_files import LABEL, READERS, read_map_file
 from maasi_filter.geometry.polygons import is_wkt, short, sound, warn
+from maasi_filter.geometry.vector_files import VECTOR_FILES, read_vector_file
 
-FILES = ('.json', '.geojson', *READERS)  # with features
+FILES = ('.json', '.geojson', *READERS, *VECTOR_FILES)  # with features
 _ROLES = ('area', 'keep_out', 'prior')  # of polygons
 _POINT_ROLES = ('start', 'home', 'charger')
 _BEYOND = 10.0  # degrees by which areas of the page may exceed 180 degrees
@@ -229,6 +230,8 @@ def _parsed(value: Any, named: bool) -> Any:
         )
     if named and Path(value).suffix.lower() in READERS:
         return read_map_file(value)
+    if named and Path(value).suffix.lower() in VECTOR_FILES:
+        return read_vector_file(value)
     try:
         # Some programs begin a file with a byte order mark.
         return json.loads(Path(value).read_text(encoding='utf-8-sig') if named else value)

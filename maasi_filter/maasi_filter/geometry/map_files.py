@@ -29,8 +29,8 @@ from maasi_filter.wording import counted
 Row = dict[str, Any]
 LABEL = 'maasi:label'  # member of a feature: the element it was read from, for messages
 
-_MOST_BYTES = 20_000_000  # of a file, and of the KML in a KMZ
-_MOST_ELEMENTS = 1_000_000  # of XML
+MOST_BYTES = 20_000_000  # of a file, and of the KML in a KMZ
+MOST_ELEMENTS = 1_000_000  # of XML
 _CORNERS = 64  # of the polygon of a circle
 _GAP = 0.05  # most between the ends of a closed track, relative to its length
 _DEGREE = 111_195.0  # of latitude [m]
@@ -55,8 +55,8 @@ def read_map_file(path: str) -> Row:
     """Return a file as a GeoJSON feature collection; ValueError names the wrong element."""
     try:
         with Path(path).open('rb') as file:
-            data = file.read(_MOST_BYTES + 1)
-        _check_size(data)
+            data = file.read(MOST_BYTES + 1)
+        check_size(data)
         rows = [*READERS[Path(path).suffix.lower()](data)]
     except OSError as error:
         raise ValueError(f'{path}: {error.strerror}') from None
@@ -65,12 +65,13 @@ def read_map_file(path: str) -> Row:
     return {'type': 'FeatureCollection', 'features': rows}
 
 
-def _check_size(data: bytes) -> None:
-    if len(data) > _MOST_BYTES:
-        raise ValueError(f'is too large, allowed are {_MOST_BYTES // 1_000_000} MB')
+def check_size(data: bytes) -> None:
+    """Raise ValueError if a file is too large."""
+    if len(data) > MOST_BYTES:
+        raise ValueError(f'is too large, allowed are {MOST_BYTES // 1_000_000} MB')
 
 
-def _row(label: str, shape: str, coordinates: Any = None, **properties: Any) -> Row:
+def feature_row(label: str, shape: str, coordinates: Any = None, **properties: Any) -> Row:
     """Return a feature; a shape that is not of GeoJSON is the text of a warning."""
     known = {key: value for key, value in properties.items() if value not in (None, '')}
     geometry = {'type': shape, 'coordinates': coordinates}
@@ -86,15 +87,21 @@ def _role(words: Mapping[str, str], texts: Iterable[str]) -> tuple[str, str]:
     return '', ''
 
 
-def _point(label: str, position: Any, name: str, texts: Sequence[str], facts: Row) -> Row:
+def polygon_role(texts: Iterable[str]) -> str:
+    """Return the role at the beginning of the first of some names, or ''."""
+    return _role(_POLYGON_WORDS, texts)[0]
+
+
+def point_row(label: str, position: Any, name: str, texts: Sequence[str], facts: Row) -> Row:
+    """Return the feature of a point; its role is in its facts, or in the texts."""
     role, rest = _role(_POINT_WORDS, texts)
     role, robot = facts.get('role') or role, facts.get('robot')
     if role not in _POINT_WORDS:
         what = f'point without a role, allowed at the start of its name: {", ".join(_POINT_WORDS)}'
-        return _row(label, what, name=name)
+        return feature_row(label, what, name=name)
     if role == 'start' and not robot:
         robot = rest or name
-    return _row(label, 'Point', position, name=name, role=role, robot=robot)
+    return feature_row(label, 'Point', position, name=name, role=role, robot=robot)
 
 
 # ----------------------------------------------------------------------------- XML
@@ -107,8 +114,8 @@ def _xml(data: bytes, root: str) -> Element:
     def start(tag: str, attributes: dict[str, str]) -> None:
         nonlocal count
         count += 1
-        if count > _MOST_ELEMENTS:
-            raise ValueError(f'has too many elements, allowed are {_MOST_ELEMENTS:,}')
+        if count > MOST_ELEMENTS:
+            raise ValueError(f'has too many elements, allowed are {MOST_ELEMENTS:,}')
         line = str(parser.CurrentLineNumber)
         builder.start(tag.rpartition(' ')[2], {**attributes, 'line': line})
 
@@ -163,19 +170,19 @@ def _kml(data: bytes, archive: Sequence[str] = ()) -> Iterator[Row]:
                 polygons.append([_kml_positions(ring, label) for ring in rings])
             elif shape.tag == 'Point':
                 (position, *_) = _kml_positions(shape, label) or [None]
-                yield _point(label, position, name, texts, facts)
+                yield point_row(label, position, name, texts, facts)
             else:
-                yield _row(label, shape.tag, name=name)
+                yield feature_row(label, shape.tag, name=name)
         if polygons:
-            role = facts.get('role') or _role(_POLYGON_WORDS, texts)[0]
+            role = facts.get('role') or polygon_role(texts)
             weight = facts.get('weight')
-            yield _row(label, 'MultiPolygon', polygons, name=name, role=role, weight=weight)
+            yield feature_row(label, 'MultiPolygon', polygons, name=name, role=role, weight=weight)
         if not shapes:
-            yield _row(label, 'no geometry', name=name)
+            yield feature_row(label, 'no geometry', name=name)
     others = [item for item in root.iter() if item.tag in _KML_OTHERS]
     others = [item for item in others if _text(item, 'Link/href') not in archive]
     for kind, count in Counter(item.tag for item in others).items():
-        yield _row(f'{count} <{kind}>', 'not read')
+        yield feature_row(f'{count} <{kind}>', 'not read')
 
 
 def _kml_positions(shape: Element, label: str) -> list[Any]:
@@ -192,7 +199,7 @@ def _kml_positions(shape: Element, label: str) -> list[Any]:
 
 
 def _kmz(data: bytes) -> Iterator[Row]:
-    files, left = {}, _MOST_BYTES
+    files, left = {}, MOST_BYTES
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             for name in archive.namelist():
@@ -203,7 +210,7 @@ def _kmz(data: bytes) -> Iterator[Row]:
     except _ZIP_ERRORS as error:
         raise ValueError(f'is not a KMZ archive: {short(str(error))}') from None
     if left < 0:
-        raise ValueError(f'its .kml are too large, allowed are {_MOST_BYTES // 1_000_000} MB')
+        raise ValueError(f'its .kml are too large, allowed are {MOST_BYTES // 1_000_000} MB')
     if not files:
         raise ValueError('there is no .kml in it')
     for name, inner in files.items():
@@ -220,17 +227,17 @@ def _gpx(data: bytes) -> Iterator[Row]:
         label = f'{item.tag} {counts[item.tag]} in line {item.get("line")}'
         name = _text(item, 'name')
         if item.tag == 'wpt':
-            yield _point(label, _gpx_position(item, label), name, [name], {})
+            yield point_row(label, _gpx_position(item, label), name, [name], {})
         for line in [item] if item.tag == 'rte' else item.findall('trkseg'):
             points = [*line.findall('rtept'), *line.findall('trkpt')]
             ring = [_gpx_position(point, label) for point in points]
             gap, length = _gap(ring)
             if gap <= _GAP * length:
-                role = _role(_POLYGON_WORDS, [name])[0]
-                yield _row(label, 'Polygon', [ring], name=name, role=role)
+                role = polygon_role([name])
+                yield feature_row(label, 'Polygon', [ring], name=name, role=role)
             else:
                 what = 'track' if item.tag == 'trk' else 'route'
-                yield _row(
+                yield feature_row(
                     label,
                     f'open {what}, ends {gap:.0f} m from its start, allowed are {_GAP:.0%} of its '
                     f'length ({_GAP * length:.0f} m)',
@@ -278,7 +285,7 @@ def _flipped(value: Any, where: str) -> list[float]:
 
 
 def _zone(label: str, rings: Any, inclusion: bool) -> Row:
-    return _row(label, 'Polygon', rings, role='area' if inclusion else 'keep_out')
+    return feature_row(label, 'Polygon', rings, role='area' if inclusion else 'keep_out')
 
 
 def _circle(label: str, centre: Any, radius: Any, inclusion: bool) -> Row:
@@ -320,7 +327,7 @@ def _plan(data: bytes) -> Iterator[Row]:
     others['rallyPoints.points'] = _part(_part(plan, 'rallyPoints', dict), 'points', list)
     for label, items in others.items():
         if items:
-            yield _row(label, f'{counted(len(items), "item")} not read, {_FENCE}')
+            yield feature_row(label, f'{counted(len(items), "item")} not read, {_FENCE}')
 
 
 def _part(data: Mapping[str, Any], key: str, kind: type, where: str = '') -> Any:
@@ -348,7 +355,7 @@ def _poly(data: bytes) -> Iterator[Row]:
             read = short(' '.join(words))
             raise ValueError(f'{label}: read {read}, allowed are latitude and longitude')
         ring.append(_flipped(words, label))
-    yield _row('polygon', 'Polygon', [ring])
+    yield feature_row('polygon', 'Polygon', [ring])
 
 
 def _waypoints(data: bytes) -> Iterator[Row]:
@@ -384,7 +391,9 @@ def _waypoints(data: bytes) -> Iterator[Row]:
     if ring:
         raise ValueError(f'{lines[-1][0]}: ends after {len(ring)} of {begun[1]} vertices: {_FEW}')
     for command, number in others.items():
-        yield _row(f'{counted(number, "item")} with command {command}', f'not read, {_FENCE}')
+        yield feature_row(
+            f'{counted(number, "item")} with command {command}', f'not read, {_FENCE}'
+        )
 
 
 _FEW = 'the polygon before is not complete'
