@@ -106,6 +106,7 @@ def refusal(path, **values):
 def test_each_format_is_the_same_area_with_a_keep_out(tmp_path, name):
     with warnings.catch_warnings():
         warnings.simplefilter('error')
+        warnings.filterwarnings('ignore', r'.*field\.waypoints: .*: home position not used')
         made = environment(written(tmp_path, name, FILES[name]))
     assert made.area.area == pytest.approx(SIZES['area'], rel=1e-3)
     assert made.keep_outs[0].polygon.area == pytest.approx(SIZES['keep_out'], rel=1e-3)
@@ -302,3 +303,20 @@ def test_a_fence_of_pymavlink_is_an_area(tmp_path):
     loader.save(str(tmp_path / 'fence.waypoints'))
     made = environment(tmp_path / 'fence.waypoints')
     assert made.area.area == pytest.approx(SIZES['area'], rel=1e-3) and len(made.keep_outs) == 1
+
+
+def test_a_home_position_is_named_as_not_used(tmp_path):
+    home = {'items': [], 'plannedHomePosition': [46.6, 9.9, 1700.0]}
+    path = written(tmp_path, 'home.plan', plan([zone(FIELD, True)], mission=home))
+    with pytest.warns(InputWarning, match=r'mission\.plannedHomePosition: home position not used'):
+        environment(path)
+    path = written(tmp_path, 'home.waypoints', waypoints(*fence(5001, FIELD)))
+    with pytest.warns(InputWarning, match='line 2: home position not used, give each robot'):
+        environment(path)
+    # What ground stations write without a home position.
+    nothing = waypoints(*fence(5001, FIELD)).replace('46.6\t9.9\t1700', '0.0\t-0.000000\t0')
+    none = plan([zone(FIELD, True)], mission={'plannedHomePosition': [0, 0, 0]})
+    for name, text in (('none.waypoints', nothing), ('none.plan', none)):
+        with warnings.catch_warnings():
+            warnings.simplefilter('error')
+            environment(written(tmp_path, name, text))

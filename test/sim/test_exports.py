@@ -110,6 +110,18 @@ def test_the_area_comes_back_from_kml_and_plan(run, files, tmp_path):
         assert kept.polygon.area == pytest.approx(50.0, abs=0.01)
 
 
+def test_a_plan_of_a_search_with_bounds_has_them_as_a_fence(run, tmp_path):
+    explored = explored_after(run)
+    origin = run.scenario.environment.origin
+    paths = run.planned_paths()
+    made = map_files('field', [], [], paths, explored, origin, NOW)['drone.plan']
+    (fence,) = json.loads(made)['geoFence']['polygons']
+    corners = to_map(np.array(fence['polygon'])[:, ::-1], origin)
+    assert fence['inclusion'] and np.allclose(
+        corners, [[0, 0], [60, 0], [60, 60], [0, 60]], atol=0.01
+    )
+
+
 def test_a_plan_has_the_waypoints_above_the_start(run, files):
     mission = json.loads(files['drone.plan'])['mission']
     chosen = [place for _, place in run.waypoints['drone']]

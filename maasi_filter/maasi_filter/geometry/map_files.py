@@ -323,11 +323,19 @@ def _plan(data: bytes) -> Iterator[Row]:
             else:
                 circle = _part(item, 'circle', dict, f'{label}.')
                 yield _circle(label, circle.get('center'), circle.get('radius'), inclusion)
-    others = {'mission.items': _part(_part(plan, 'mission', dict), 'items', list, 'mission.')}
+    mission = _part(plan, 'mission', dict)
+    home = mission.get('plannedHomePosition')
+    if isinstance(home, list) and any(home):
+        yield _home('mission.plannedHomePosition')
+    others = {'mission.items': _part(mission, 'items', list, 'mission.')}
     others['rallyPoints.points'] = _part(_part(plan, 'rallyPoints', dict), 'points', list)
     for label, items in others.items():
         if items:
             yield feature_row(label, f'{counted(len(items), "item")} not read, {_FENCE}')
+
+
+def _home(label: str) -> Row:
+    return feature_row(label, 'home position not used, give each robot its start')
 
 
 def _part(data: Mapping[str, Any], key: str, kind: type, where: str = '') -> Any:
@@ -387,7 +395,9 @@ def _waypoints(data: bytes) -> Iterator[Row]:
         elif command in _CIRCLES:
             yield _circle(label, words[8:10], words[4], _CIRCLES[command])
         elif index or command != 16:
-            others[command] += 1  # the first item is the home position
+            others[command] += 1
+        elif any(word.strip('-0.') for word in words[8:10]):
+            yield _home(label)  # the first item
     if ring:
         raise ValueError(f'{lines[-1][0]}: ends after {len(ring)} of {begun[1]} vertices: {_FEW}')
     for command, number in others.items():

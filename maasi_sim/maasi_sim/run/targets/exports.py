@@ -51,7 +51,8 @@ def map_files(
     robot (n, 3) [m]; written: now, in UTC.
     """
     found = [{key: value for key, value in row.items() if key not in _TRUTH} for row in found]
-    plans = {f'{robot}.plan': plan_text(path, searched, origin) for robot, path in paths.items()}
+    zones = [*searched, *_bounds(searched, explored, origin)]
+    plans = {f'{robot}.plan': plan_text(path, zones, origin) for robot, path in paths.items()}
     return {
         'search.kml': kml_text(name, found, searched),
         'found_targets.gpx': gpx_text(found),
@@ -59,6 +60,17 @@ def map_files(
         **probability_rasters(explored, origin),
         **{name: text for name, text in plans.items() if text},
     }
+
+
+def _bounds(searched: Sequence[Row], explored: UnexploredMap, origin: OriginSettings) -> list[Row]:
+    """Return the bounds as area of a search without one."""
+    if any(feature['properties']['kind'] == 'area' for feature in searched):
+        return []
+    (west, east), (south, north) = explored.bounds[:2].tolist()
+    corners = [[west, south], [east, south], [east, north], [west, north], [west, south]]
+    ring = geodetic(np.array(corners), origin)[:, 1::-1].round(8).tolist()
+    geometry = {'type': 'Polygon', 'coordinates': [ring]}
+    return [{'type': 'Feature', 'geometry': geometry, 'properties': {'kind': 'area'}}]
 
 
 def _add(parent: Element, tag: str, text: object = '', **attributes: object) -> Element:
