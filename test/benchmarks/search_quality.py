@@ -106,8 +106,11 @@ def likely(side, turned=False, shifted=0.0):
     return {'environment': {'prior': {'polygons': parts}}}
 
 
-def large(squares, detection, number, prior='', **wrong):
-    """Return the regime of an area of so many squares of a swath (20 m), and drones at its edge."""
+def large(squares, detection, number, prior='', battery=0.0, **wrong):
+    """Return the regime of an area of so many squares of a swath (20 m), and drones at its edge.
+
+    battery: share of a pass by one drone alone that a drone flies before it charges; 0: all.
+    """
     side = 20.0 * math.sqrt(squares)
     most = round(side / 20.0)
     starts = [(side * (i + 0.5) / number, 1.0, 30.0) for i in range(number)]
@@ -119,9 +122,9 @@ def large(squares, detection, number, prior='', **wrong):
     }
     drone = robots(
         candidates=grid,
-        motion={'speed': 5.0, 'acceleration': 5.0},
+        motion={'speed': SPEED, 'acceleration': 5.0},
         sensor={'detection': DETECTIONS[detection]},
-        battery={'capacity': 1e7},  # lasts until the limit
+        **battery_for(squares, battery),
     )
     priors = [likely(side, **wrong)] if prior else []
     return Regime(
@@ -134,6 +137,17 @@ def large(squares, detection, number, prior='', **wrong):
     )
 
 
+def battery_for(squares, share):
+    """Return a battery that lasts for a share of a pass of so many squares; 0: to the limit."""
+    if not share:
+        return {'battery': {'capacity': 1e7}}
+    power = {'idle_power': 270.0, 'motion_power': 10.0, 'charging_power': 1500.0}
+    capacity = share * squares * 20.0 / SPEED * (270.0 + 10.0 * SPEED)
+    use = {'per_second': 270.0 / capacity, 'per_metre': 10.0 / capacity, 'reserve': 0.1}
+    return {'battery': {'capacity': capacity, **power}, 'endurance': use}
+
+
+SPEED = 5.0  # of the drones of large areas [m/s]
 CORNERS = ((-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1))
 # Both see a width of 20 m at 5 m/s, with a measurement each second: the box all of it, the other
 # one half.
@@ -152,6 +166,11 @@ for squares in (100, 300):
     for wrong in ({'turned': True}, {'shifted': 0.25}):
         name = f'{squares} squares, box, 3, prior {next(iter(wrong))}'
         REGIMES[name] = large(squares, 'box', 3, 'prior', **wrong)
+for squares, share, prior, number in itertools.product(
+    (100, 300), (0.3, 0.6), ('', ', prior'), (1, 3, 10)
+):
+    name = f'{squares} squares, box, {number}{prior}, battery {share}'
+    REGIMES[name] = large(squares, 'box', number, prior, share)
 STOPS = [robots(motion={'arrival_radius': 0.0})]
 # What is compared; differences are to the first one.
 KINDS = {
