@@ -38,7 +38,8 @@ PARTS = {
         'Do: one task each, with the commands or the code.',
         [
             'install',
-            *(f'how_to/{name}' for name in ('search_area', 'map_files', 'keep_outs', 'people')),
+            *(f'how_to/{name}' for name in ('search_area', 'map_files', 'keep_outs', 'terrain')),
+            'how_to/people',
             'how_to/batteries',
             *(
                 f'how_to/{name}'

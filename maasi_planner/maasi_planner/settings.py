@@ -193,7 +193,8 @@ class RobotModel(Settings):
 
     start: Vector3 = Field(
         [0.0, 0.0, 0.0],
-        description='Start position; in 2D its height is that of the waypoints [m, map]',
+        description='Start position; in 2D its height is that of the waypoints, and over terrain '
+        'above the ground [m, map]',
     )
     radius: Positive = Field(0.1, description='Radius of a circle around the robot [m]')
     motion: MotionSettings = Field(

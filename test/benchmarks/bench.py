@@ -6,7 +6,7 @@ import os
 from importlib import import_module
 from pathlib import Path
 
-AREAS = ('filter', 'planner', 'scale', 'cuboid', 'drivers', 'system', 'view')
+AREAS = ('filter', 'planner', 'scale', 'cuboid', 'drivers', 'terrain', 'system', 'view')
 
 
 def show(row):

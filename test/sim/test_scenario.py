@@ -70,7 +70,7 @@ def load(tmp_path):
 def test_our_scenarios_load_are_written_the_same_and_every_point_can_be_seen(path, load):
     scenario = load_scenario(path)
     assert never_seen(scenario) == ''
-    targets = {'no_targets': 0, 'field': 8, 'field_batteries': 6}.get(path.stem, 12)
+    targets = {'no_targets': 0, 'field': 8, 'field_batteries': 6, 'hills': 8}.get(path.stem, 12)
     for seed in range(10):
         assert len(scenario.world(seed).targets) == targets
     assert load(scenario.text()) == scenario
