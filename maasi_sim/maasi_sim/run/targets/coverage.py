@@ -10,7 +10,9 @@ import shapely
 from shapely.geometry.base import BaseGeometry
 
 from maasi_filter.arrays import BoolArray, FloatArray
+from maasi_filter.geometry.terrain import Terrain
 from maasi_filter.models.detection import DetectionModel
+from maasi_filter.models.line_of_sight import probability_in_sight
 from maasi_filter.models.pose import Pose
 from maasi_filter.unexplored_map import UnexploredMap, reach_of
 from maasi_sim.run.log import RunLog
@@ -52,7 +54,8 @@ def searched_at_least(record: RunLog, explored: UnexploredMap) -> tuple[list[flo
     for name, poses in record.measured_from.items():
         sensor = record.scenario.robots[name].sensor.build(name, dimension)
         before = np.zeros(passes.shape, bool)
-        for seen in _fields(axes, sensor.detection, [pose for _, pose in poses]):
+        measured = [pose for _, pose in poses]
+        for seen in _fields(axes, sensor.detection, measured, area.terrain):
             passes += seen & ~before
             before = seen
     ground = np.stack(np.meshgrid(*axes[:2], indexing='ij'), axis=-1)
@@ -62,20 +65,23 @@ def searched_at_least(record: RunLog, explored: UnexploredMap) -> tuple[list[flo
 
 
 def _fields(
-    axes: Sequence[FloatArray], detection: DetectionModel, poses: Sequence[Pose]
+    axes: Sequence[FloatArray],
+    detection: DetectionModel,
+    poses: Sequence[Pose],
+    terrain: Terrain | None,
 ) -> Iterator[BoolArray]:
     """Yield the cells that each measurement of a robot has searched."""
-    largest = [_probabilities(axes, detection, pose)[1].max(initial=0.0) for pose in poses]
+    largest = [_probabilities(axes, detection, pose, None)[1].max(initial=0.0) for pose in poses]
     least = max(_SEEN * max(largest, default=0.0), _LEAST)
     for pose in poses:
         seen = np.zeros([len(axis) for axis in axes], bool)
-        near, values = _probabilities(axes, detection, pose)
+        near, values = _probabilities(axes, detection, pose, terrain)
         seen[near] = values >= least
         yield seen
 
 
 def _probabilities(
-    axes: Sequence[FloatArray], detection: DetectionModel, pose: Pose
+    axes: Sequence[FloatArray], detection: DetectionModel, pose: Pose, terrain: Terrain | None
 ) -> tuple[tuple[slice, ...], FloatArray]:
     """Return the detection probabilities in the cells within reach, and which these are."""
     near = tuple(
@@ -86,7 +92,7 @@ def _probabilities(
     points = np.stack(np.meshgrid(*parts, indexing='ij'), axis=-1)
     if not points.size:
         return near, np.zeros(points.shape[:-1])
-    values = detection.probability(points.reshape(-1, len(axes)), pose)
+    values = probability_in_sight(detection, points.reshape(-1, len(axes)), pose, terrain)
     return near, np.asarray(values).reshape(points.shape[:-1])
 
 
