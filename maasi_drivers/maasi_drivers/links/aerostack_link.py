@@ -1,6 +1,7 @@
 """A drone that Aerostack2 flies."""
 
-from typing import Any
+from functools import partial
+from typing import Any, cast
 
 from action_msgs.msg import GoalStatus as ActionStatus
 from rclpy.action.client import ActionClient
@@ -21,8 +22,7 @@ _TAKE_OFF, _GO_TO, _LAND = 'TakeoffBehavior', 'GoToBehavior', 'LandBehavior'
 class AerostackLink(PlatformLink):
     """A drone behind the behaviors of Aerostack2; see `PlatformLink`.
 
-    Without a further goal its behavior ends at the last position, where it hovers. Aerostack2
-    does not abort a take-off without an emergency: it lands after it.
+    Without a further goal it hovers at the last position. It lands only after a take-off.
 
     Subscribes
     ----------
@@ -31,11 +31,8 @@ class AerostackLink(PlatformLink):
 
     Services
     --------
-    client of `/NAMESPACE/set_arming_state`, `set_offboard_mode` (std_srvs/SetBool)
-
-    Actions
-    -------
-    client of `/NAMESPACE/TakeoffBehavior`, `GoToBehavior`, `LandBehavior` (as2_msgs)
+    client of `/NAMESPACE/set_arming_state`, `set_offboard_mode` (std_srvs/SetBool), and of the
+    actions `TakeoffBehavior`, `GoToBehavior`, `LandBehavior` (as2_msgs)
     """
 
     system, package, parts = 'Aerostack2', 'as2_msgs', ('msg', 'action')
@@ -45,59 +42,50 @@ class AerostackLink(PlatformLink):
 
     def __init__(self, driver: RobotNode) -> None:
         super().__init__(driver)
-        self._info: Any = None
+        self._info, self._states = cast(Any, None), self.messages.PlatformStatus
         # The latest goal of `GoToBehavior`: its number, and its handle once accepted.
-        self._number = 0
-        self._handle: Any = None
-        action = self.orders
-        kinds = {_TAKE_OFF: action.Takeoff, _GO_TO: action.GoToWaypoint, _LAND: action.Land}
-        self._actions = {name: self._client(name, kind) for name, kind in kinds.items()}
+        self._number, self._handle = 0, cast(Any, None)
+        kind = self.orders
+        kinds = {_TAKE_OFF: kind.Takeoff, _GO_TO: kind.GoToWaypoint, _LAND: kind.Land}
+        self._actions = {
+            name: driver.permanent(name, partial(ActionClient, driver, kind, self.full(name)))
+            for name, kind in kinds.items()
+        }
         self._switches: dict[str, Client] = {
-            name: driver.create_client(SetBool, f'{self.namespace}/{name}')
+            name: driver.create_client(SetBool, self.full(name))
             for name in ('set_arming_state', 'set_offboard_mode')
         }
-
-    def _client(self, name: str, kind: Any) -> ActionClient:
-        topic = f'{self.namespace}/{name}'
-        return self.driver.permanent(topic, lambda: ActionClient(self.driver, kind, topic))
 
     def connect(self) -> None:
         """Subscribe to pose, state and battery."""
         super().connect()
-        topic, kind = f'{self.namespace}/platform/info', self.messages.PlatformInfo
+        topic, kind = self.full('platform/info'), self.messages.PlatformInfo
         self.driver.create_subscription(
             kind, topic, lambda message: setattr(self, '_info', message), RELIABLE
         )
-        BatteryTopic(self.driver, f'{self.namespace}/sensor_measurements/battery')
+        BatteryTopic(self.driver, self.full('sensor_measurements/battery'))
 
     def missing(self) -> str:
         """See `PlatformLink.missing`."""
-        return ', '.join(
-            [
-                f'{self.namespace}/{name}'
-                for name, item in self._actions.items()
-                if not item.server_is_ready()
-            ]
-            + [item.srv_name for item in self._switches.values() if not item.service_is_ready()]
-        )
+        ready = {name: item.server_is_ready() for name, item in self._actions.items()}
+        ready |= {name: item.service_is_ready() for name, item in self._switches.items()}
+        return ', '.join(self.full(name) for name, there in ready.items() if not there)
 
     def aloft(self) -> bool | None:
         """See `PlatformLink.aloft`."""
-        kinds = self.messages.PlatformStatus
-        if self._info is None or self._info.status.state == kinds.EMERGENCY:
+        if self._info is None or self._info.status.state == self._states.EMERGENCY:
             return None
-        return self._info.status.state not in (kinds.DISARMED, kinds.LANDED)
+        return self._info.status.state not in (self._states.DISARMED, self._states.LANDED)
 
     def took_off(self, height: float) -> bool:
         """See `PlatformLink.took_off`; earlier goals are refused."""
-        flying = self.messages.PlatformStatus.FLYING
-        return self._info is not None and self._info.status.state == flying
+        return self._info is not None and self._info.status.state == self._states.FLYING
 
     def fault(self) -> str:
         """See `PlatformLink.fault`."""
         if self._info is None:
-            return f'no {self.namespace}/platform/info'
-        if self._info.status.state == self.messages.PlatformStatus.EMERGENCY:
+            return f'no {self.full("platform/info")}'
+        if self._info.status.state == self._states.EMERGENCY:
             return 'Aerostack2 reports an emergency'
         return '' if self._info.connected else 'Aerostack2 is not connected to the drone'
 
@@ -110,6 +98,8 @@ class AerostackLink(PlatformLink):
         def proceed(future: Any = None) -> None:
             if future is not None and not future.result().success:
                 self.failed('arming or offboard mode refused')
+            elif self.stopped:
+                self.failed('take-off stopped')
             elif missing:
                 request = SetBool.Request(data=True)
                 self._switches[missing.pop(0)].call_async(request).add_done_callback(proceed)
@@ -124,12 +114,11 @@ class AerostackLink(PlatformLink):
 
     def go_to(self, target: FloatArray, yaw: float, distance: float) -> None:
         """See `PlatformLink.go_to`; a further goal replaces the present one."""
-        kinds = self.messages.YawMode
         goal = self.orders.GoToWaypoint.Goal(max_speed=self.driver.settings.motion.speed)
-        goal.yaw.mode, goal.yaw.angle = kinds.FIXED_YAW, yaw
+        goal.yaw.mode, goal.yaw.angle = self.messages.YawMode.FIXED_YAW, yaw
         goal.target_pose.header.frame_id = self.platform.frame or self.frame
         goal.target_pose.point = point_to_ros(target.tolist())
-        self._number, number = self._number + 1, self._number + 1
+        self._number = number = self._number + 1
         future = self._actions[_GO_TO].send_goal_async(goal)
         future.add_done_callback(lambda answer: self._answered(number, answer.result()))
 
@@ -150,13 +139,11 @@ class AerostackLink(PlatformLink):
 
     def hover(self) -> None:
         """See `PlatformLink.hover`: the end of a goal."""
-        self._number += 1
-        if self._handle is not None:
-            self._handle.cancel_goal_async()
-            self._handle = None
+        self._number, handle, self._handle = self._number + 1, self._handle, None
+        if handle is not None:
+            handle.cancel_goal_async()
 
     def land(self, height: float) -> None:
         """See `PlatformLink.land`."""
         self.hover()
-        goal = self.orders.Land.Goal(land_speed=self.platform.climb)
-        self._actions[_LAND].send_goal_async(goal)
+        self._actions[_LAND].send_goal_async(self.orders.Land.Goal(land_speed=self.platform.climb))

@@ -49,14 +49,13 @@ class CrazyswarmLink(PlatformLink):
             'notify_setpoints_stop': srv.NotifySetpointsStop,
         }
         self._clients = {
-            name: driver.create_client(kind, f'{self.namespace}/{name}')
-            for name, kind in kinds.items()
+            name: driver.create_client(kind, self.full(name)) for name, kind in kinds.items()
         }
 
     def connect(self) -> None:
         """Subscribe to pose and status."""
         super().connect()
-        topic = f'{self.namespace}/status'
+        topic = self.full('status')
         self.driver.create_subscription(
             self.messages.Status, topic, self._on_status, sensor_reader(False)
         )

@@ -118,7 +118,7 @@ class PlatformLink(RobotLink):
 
     def connect(self) -> None:
         """Subscribe to its poses."""
-        driver, topic = self.driver, f'{self.namespace}/{self.pose_topic}'
+        driver, topic = self.driver, self.full(self.pose_topic)
         driver.pose_name = topic
         PoseTopic(driver, self._handle_pose, topic, self.platform.frame or self.frame)
         driver.offer_arm(self._arm, lambda: self.phase is Phase.FLYING)
@@ -253,6 +253,15 @@ class PlatformLink(RobotLink):
         height = self._height()
         self.land(self._take_off_height() if height is None else max(height, 0.0))
         return True
+
+    def full(self, name: str) -> str:
+        """Return the full name of a topic or service of the system."""
+        return f'{self.namespace}/{name}'
+
+    @property
+    def stopped(self) -> bool:
+        """Whether the take-off is not wanted any more."""
+        return self.phase is not Phase.RISING or bool(self._then_land) or not self.driver.active
 
     def failed(self, reason: str) -> None:
         """Note that the system refused to take off."""
