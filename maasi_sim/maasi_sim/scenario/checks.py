@@ -127,6 +127,11 @@ def _terrain_problems(robot: RobotSettings, area: Area) -> Problems:
             f'link: read {robot.link} with environment.terrain; allowed with it are '
             f'{" and ".join(TERRAIN_LINKS)}: the driver does not control heights of the others'
         )
+    elif robot.link == 'mavlink' and not robot.external:
+        yield (
+            'link: read mavlink with environment.terrain; allowed in simulation is topics, or '
+            'autopilot: external, as the simulated autopilot has level ground'
+        )
     elif robot.flies and robot.start[2] < least_height(robot):
         yield (
             f'start: read height {robot.start[2]:g}, allowed over environment.terrain is at least '

@@ -1,0 +1,48 @@
+"""Searches over terrain: what a scenario is refused for, and heights of robots and targets."""
+
+from copy import deepcopy
+
+import numpy as np
+import pytest
+
+from maasi_sim.scenario.layering import ScenarioError
+from maasi_sim.scenario.loading import load_scenario, scenario_from_values
+from maasi_sim.simulation.robots import Simulation
+
+MAVLINK = {'arm': True, 'url': 'udpin:127.0.0.1:14577'}
+
+
+@pytest.mark.parametrize(
+    ('changes', 'text'),
+    [
+        ({'link': 'mavlink', 'mavlink': MAVLINK}, r'west\.link: read mavlink with environment'),
+        ({'start': [-240.0, -180.0, 2.0]}, r'west\.start: read height 2, .* at least 2\.5 m above'),
+    ],
+)
+def test_what_robots_cannot_do_over_terrain_is_refused_by_name(changes, text):
+    values = deepcopy(load_scenario('hills').content())
+    values['robots']['west'] |= changes
+    with pytest.raises(ScenarioError, match=text):
+        scenario_from_values(values, 'test')
+    other = deepcopy(load_scenario('hills').content())
+    other['filter'] = {'method': 'ic_phd'}
+    with pytest.raises(ScenarioError, match=r"filter\.method: read 'ic_phd' with environment"):
+        scenario_from_values(other, 'test')
+
+
+def test_robots_and_targets_are_at_heights_above_the_ground():
+    simulation = Simulation(load_scenario('hills'), 1)
+    terrain = simulation.world.area.terrain
+    targets = simulation.world.targets_3d_at(0)
+    assert targets[:, 2] == pytest.approx(terrain.heights(targets))
+    assert np.ptp(targets[:, 2]) > 5.0
+    heights = {'east': 30.0, 'west': 30.0, 'rover': 1.5}
+    for _ in range(50):
+        simulation.robots['rover'].command([2.0, 0.0, 0.0, 0.1])
+        simulation.advance()
+    for name, robot in simulation.robots.items():
+        position = robot.state.pose.position
+        assert position[2] - terrain.height(position) == pytest.approx(heights[name], abs=1e-6)
+    moved = simulation.robots['rover'].state.pose.position
+    assert np.linalg.norm(moved[:2]) > 5.0
+    assert abs(moved[2] - 1.5 - terrain.height([0.0, 0.0])) > 0.5
