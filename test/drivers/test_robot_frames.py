@@ -210,6 +210,18 @@ def test_odometry_that_says_that_it_is_in_the_map_is_taken_as_that(play, capfd, 
     assert "but previous messages were in 'map'" in capfd.readouterr().err
 
 
+def test_a_first_message_in_the_wrong_frame_does_not_block_the_robot(play):
+    driver, team = play(odometry_origin='first')
+    team.odometry_frame = 'map'
+    team.say()
+    team.until(lambda: team.states)
+    team.odometry_frame = 'odom'
+    team.until(lambda: team.say() or len(team.states) > 3)
+    assert driver.dropped['odometry'] == 0
+    assert_allclose(pose_from_ros(team.state.pose.pose).position, team.start.position, atol=0.02)
+    team.send_accepted([1.0, 1.0, 0.0])
+
+
 def test_a_goal_in_another_frame_is_reached_where_that_is(play):
     driver, team = play()
     static = team.create_publisher(TFMessage, '/tf_static', LATCHED)

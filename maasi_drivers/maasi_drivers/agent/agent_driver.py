@@ -164,11 +164,15 @@ class AgentDriver(RobotNode):
 
     def reset(self) -> None:
         """Discard data from before a jump back in time."""
-        self.end_goal(GoalStatus.ABORTED, 'time jumped back')
+        self.restart('time jumped back')
+
+    def restart(self, reason: str) -> None:
+        """See `RobotNode.restart`."""
+        self.end_goal(GoalStatus.ABORTED, reason)
         if not self.settings.lockstep:
             # Its pose is unknown: it stays stopped until a new one arrives.
             self.link.hold()
-            self.health.begin(ODOMETRY, f'no {self.pose_name} since time jumped back')
+            self.health.begin(ODOMETRY, f'no {self.pose_name} since {reason}')
         self.history.clear()
         self.frames.clear()
         self._responder.reset()

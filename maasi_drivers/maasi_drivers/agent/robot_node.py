@@ -169,6 +169,10 @@ class RobotNode(LockstepLifecycleNode[DriverSettings], ABC):
         return True
 
     @abstractmethod
+    def restart(self, reason: str) -> None:
+        """Stop the robot and discard what is known of its motion, for a reason."""
+
+    @abstractmethod
     def take_pose(self, placed: StampedPose) -> None:
         """Handle the robot's pose, later than all before; the next command uses it."""
 

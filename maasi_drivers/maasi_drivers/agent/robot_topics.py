@@ -16,6 +16,8 @@ from maasi_filter.ros.conversions import FARTHEST, FASTEST, bounded, pose_from_r
 from maasi_filter.ros.lifecycle_node import LockstepLifecycleNode
 from maasi_filter.ros.qos import sensor_reader
 
+_CONFIRMED = 3  # so many messages in a row fix their frame; one that is wrong must not
+
 
 class OdometryTopic:
     """Passes poses on `odom` to `driver.take_pose`."""
@@ -23,6 +25,7 @@ class OdometryTopic:
     def __init__(self, driver: RobotNode) -> None:
         self._driver = driver
         self._in_map: bool | None = None  # of previous messages
+        self._in_a_row = 0  # number of them
         quality = sensor_reader(driver.settings.lockstep)
         driver.create_subscription(Odometry, 'odom', self._on_odometry, quality)
 
@@ -53,14 +56,28 @@ class OdometryTopic:
                 f'header.frame_id: read {frame!r}, allowed is '
                 + (repr(wanted) if wanted else f"'odom' or '{driver.robot}/odom' (odometry_frame)")
             )
-        if self._in_map not in (None, in_map):
-            before = 'in' if self._in_map else 'not in'
+        before = 'in' if self._in_map else 'not in'
+        changed = self._in_map not in (None, in_map)
+        if changed and self._in_a_row >= _CONFIRMED:
             raise ValueError(
                 f'header.frame_id: read {frame!r}, but previous messages were {before} '
                 f'{settings.frame!r}; allowed is one frame'
             )
         pose = pose_from_ros(message.pose.pose)
         covariance = np.asarray(message.pose.covariance)
+        linear, angular = message.twist.twist.linear, message.twist.twist.angular
+        bounded('twist.linear', (linear.x, linear.y, linear.z), FASTEST)
+        bounded('twist.angular', (angular.x, angular.y, angular.z), FASTEST)
+        bounded('pose.covariance', covariance, FARTHEST**2)
+        # The message is valid: from here on it may change what is known of the odometry.
+        if changed:
+            driver.get_logger().warning(
+                f'odom: header.frame_id is {frame!r}, the first messages were {before} '
+                f'{settings.frame!r}: restarting'
+            )
+            driver.restart('the frame of the odometry changed')
+            driver.map_odometry, self._in_a_row = None, 0
+        self._in_map, self._in_a_row = in_map, self._in_a_row + 1
         if driver.map_odometry is None:
             origin = pose if settings.odometry_origin == 'first' and not in_map else None
             driver.map_odometry = MapOdometry(
@@ -71,11 +88,6 @@ class OdometryTopic:
                     f'odom: header.frame_id is {frame!r}: using its poses as map poses, without '
                     'adding start and yaw; set odometry_origin: map to confirm'
                 )
-        self._in_map = in_map
-        linear, angular = message.twist.twist.linear, message.twist.twist.angular
-        bounded('twist.linear', (linear.x, linear.y, linear.z), FASTEST)
-        bounded('twist.angular', (angular.x, angular.y, angular.z), FASTEST)
-        bounded('pose.covariance', covariance, FARTHEST**2)
         # A negative first variance stands for an unknown covariance.
         known = covariance.any() and covariance[0] >= 0.0
         return driver.map_odometry.apply(
