@@ -41,7 +41,8 @@ def watch(run, address):
         shown.until("/[^.]$/.test(document.querySelector('#controls [role=status]').innerText)")
         run.answer = shown.page.inner_text('#controls [role=status]')
         shown.until("document.querySelectorAll('#cameras img').length === 2")
-        run.pictures = [image.get_attribute('alt') for image in shown.page.locator('#cameras img').all()]
+        images = shown.page.locator('#cameras img').all()
+        run.pictures = [image.get_attribute('alt') for image in images]
         shown.until('document.body.dataset.connection === "ended"', PATIENCE)
         shown.page.keyboard.press('End')
         shown.settle()
