@@ -1,6 +1,6 @@
-"""Statements of persons during a search: checks, and what they say about a target's existence.
+"""Statements of people during a search: checks, and what they say about a target's existence.
 
-The equations are in `docs/filter.md`, section "Reports of persons".
+The equations are in `docs/filter.md`, section "Statements of people".
 """
 
 from __future__ import annotations
