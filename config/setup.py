@@ -14,7 +14,7 @@ setup(
         ('share/maasi_config/foxglove', glob('foxglove/*.json')),
         ('share/maasi_config/rviz', glob('rviz/*.rviz')),
     ],
-    python_requires='>=3.10,<3.14',
+    python_requires='>=3.10,<3.15',
     extras_require={'test': ['pytest>=7.4', 'PyYAML>=6.0.1']},
     zip_safe=True,
     maintainer='The MAASI developers',

@@ -11,7 +11,7 @@ setup(
         ('share/maasi_drivers', ['package.xml']),
         ('share/maasi_drivers/launch', glob('launch/*.launch.py')),
     ],
-    python_requires='>=3.10,<3.14',
+    python_requires='>=3.10,<3.15',
     install_requires=[
         'maasi_filter',
         'maasi_planner',

@@ -11,7 +11,7 @@ setup(
         ('share/maasi_filter', ['package.xml']),
         ('share/maasi_filter/launch', glob('launch/*.launch.py')),
     ],
-    python_requires='>=3.10,<3.14',
+    python_requires='>=3.10,<3.15',
     install_requires=[
         'numba>=0.59',
         'numpy>=1.26,<3',

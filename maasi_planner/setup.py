@@ -11,7 +11,7 @@ setup(
         ('share/maasi_planner', ['package.xml']),
         ('share/maasi_planner/launch', glob('launch/*.launch.py')),
     ],
-    python_requires='>=3.10,<3.14',
+    python_requires='>=3.10,<3.15',
     install_requires=[
         'maasi_filter',
         'numba>=0.59',

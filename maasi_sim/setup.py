@@ -16,7 +16,7 @@ setup(
         ('share/maasi_sim', ['package.xml']),
         ('share/maasi_sim/launch', glob('launch/*.launch.py')),
     ],
-    python_requires='>=3.10,<3.14',
+    python_requires='>=3.10,<3.15',
     install_requires=[
         'maasi_config',
         'maasi_drivers',

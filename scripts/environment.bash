@@ -1,6 +1,6 @@
 # Sets up what is missing (virtual environment, ROS 2 Jazzy wheels, build of all packages) and
 # exports the environment in which the commands run. Sourced by the commands in this folder.
-#   PYTHON            interpreter to use (3.10 to 3.13)
+#   PYTHON            interpreter to use (3.10 to 3.14)
 #   MAASI_REQUIREMENTS   folder of requirements*.txt (default: the repository)
 #   MAASI_WORKSPACE   where environment and build go (default: .workspace in the repository)
 
@@ -28,13 +28,13 @@ maasi_fail() {
 
 maasi_find_python() {
   local candidate
-  for candidate in ${PYTHON:-python3 python3.12 python3.11 python3.13 python3.10}; do
+  for candidate in ${PYTHON:-python3 python3.12 python3.11 python3.13 python3.10 python3.14}; do
     # The interpreter itself, not what chooses one at each call.
     "$candidate" -ISc 'import sys
-(3, 10) <= sys.version_info[:2] <= (3, 13) or sys.exit(1)
+(3, 10) <= sys.version_info[:2] <= (3, 14) or sys.exit(1)
 print(sys.executable)' 2> /dev/null && return
   done
-  maasi_fail "no Python 3.10 to 3.13 was found${PYTHON:+ at PYTHON=$PYTHON}" \
+  maasi_fail "no Python 3.10 to 3.14 was found${PYTHON:+ at PYTHON=$PYTHON}" \
     'install one, for example: sudo apt install python3 python3-venv'
 }
 

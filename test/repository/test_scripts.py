@@ -62,7 +62,7 @@ def test_an_environment_that_cannot_be_set_up_ends_a_script_but_no_interactive_s
     commands = f'source {SCRIPTS / "environment.bash"}; echo "status $?"'
     result = call('bash', '--norc', '-ic', commands, PYTHON='no_such_python')
     assert 'status 2' in result.stdout
-    assert 'no Python 3.10 to 3.13 was found at PYTHON=no_such_python' in result.stderr
+    assert 'no Python 3.10 to 3.14 was found at PYTHON=no_such_python' in result.stderr
     result = call(SCRIPTS / 'run_scenario', '--list', PYTHON='no_such_python')
     assert (result.returncode, result.stdout) == (2, '')
     assert 'PYTHON=no_such_python' in result.stderr

@@ -77,33 +77,36 @@ export function showRobots(body, log, time, selected, onSelect) {
     const event = log.at('robot', name, time);
     return [name, stateOf(log, name, time), event && event[4]];
   });
-  // New rows lose the keyboard focus.
   const key = JSON.stringify([shown, selected, document.documentElement.dataset.theme]);
   if (body.dataset.key === key) return;
   body.dataset.key = key;
-  body.replaceChildren(
-    ...shown.map(([name, state]) => {
-      const event = log.at('robot', name, time);
-      const row = element('tr', name === selected ? 'selected' : '');
-      row.dataset.robot = name;
-      pressable(row, () => onSelect(name));
-      const first = element('td', '');
-      const swatch = element('span', 'swatch');
-      swatch.style.background = event && isAway(event) ? themed('--away') : robotColour(names, name);
-      first.append(swatch, name);
-      first.title = (log.scene.robots[name] || {}).description || '';
-      const battery = element('td', '');
-      if (event && event[4] >= 0) {
-        const bar = element('span', 'bar');
-        const level = element('i', '');
-        level.style.width = `${Math.round(100 * event[4])}%`;
-        bar.append(level);
-        battery.append(bar, `${Math.round(100 * event[4])} %`);
-      } else battery.append('unknown');
-      row.append(first, element('td', 'text', state), battery);
-      return row;
-    }),
-  );
+  // New rows lose the keyboard focus, and a click that has begun.
+  if ([...body.rows].map((row) => row.dataset.robot).join() !== names.join()) {
+    body.replaceChildren(...names.map((name) => robotRow(log, name, onSelect)));
+  }
+  shown.forEach(([name, state], index) => {
+    const [row, event] = [body.rows[index], log.at('robot', name, time)];
+    const [first, text, battery] = row.cells;
+    const known = Boolean(event && event[4] >= 0);
+    row.classList.toggle('selected', name === selected);
+    first.firstChild.style.background = event && isAway(event) ? themed('--away') : robotColour(names, name);
+    text.textContent = state;
+    battery.firstChild.hidden = !known;
+    if (known) battery.firstChild.firstChild.style.width = `${Math.round(100 * event[4])}%`;
+    battery.lastChild.textContent = known ? `${Math.round(100 * event[4])} %` : 'unknown';
+  });
+}
+
+function robotRow(log, name, onSelect) {
+  const [row, first, battery, bar] = [element('tr', ''), element('td', ''), element('td', ''), element('span', 'bar')];
+  row.dataset.robot = name;
+  pressable(row, () => onSelect(name));
+  first.append(element('span', 'swatch'), name);
+  first.title = (log.scene.robots[name] || {}).description || '';
+  bar.append(element('i', ''));
+  battery.append(bar, document.createTextNode(''));
+  row.append(first, element('td', 'text', ''), battery);
+  return row;
 }
 
 export function showLog(list, log, time, onChoose) {
