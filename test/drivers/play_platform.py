@@ -50,7 +50,7 @@ def polynomial(duration, start, velocity, acceleration, goal):
 
 
 class Drone(Node):
-    """What both have: a pose, and where it is told to go."""
+    """What both have: a pose, and the position that it flies to."""
 
     frame = topic = ''
 

@@ -97,7 +97,7 @@ def test_detections_are_on_the_slope():
     reading = detector.detect(blobs_at(pixels), pose)
     assert_allclose(reading.positions, target[:, :2], atol=1e-6)
     flat = MarkerDetector(settings, 2).detect(blobs_at(pixels), pose)
-    # The plane z = 0 is 4.5 m lower there: the ray goes on by a sixth to a fifth of its length.
+    # The plane z = 0 is 4.5 m lower there: the ray is longer by a sixth to a fifth of its length.
     assert np.linalg.norm(flat.positions - target[:, :2]) > 0.3
 
 

@@ -77,7 +77,7 @@ def test_area_and_keep_out_in_any_coordinate_system(tmp_path, name, crs):
     assert sizes(field(tmp_path, name, crs)) == pytest.approx(SIZES, abs=2.0)
 
 
-@pytest.mark.skipif(OGR is None, reason='needs ogr2ogr')
+@pytest.mark.skipif(OGR is None, reason='needs ogr2ogr (sudo apt install gdal-bin)')
 @pytest.mark.parametrize('name', ['made.gpkg', 'made.shp'])
 def test_files_of_ogr2ogr(tmp_path, name):
     rows = [

@@ -104,6 +104,15 @@ def point_row(label: str, position: Any, name: str, texts: Sequence[str], facts:
     return feature_row(label, 'Point', position, name=name, role=role, robot=robot)
 
 
+def polygons_row(
+    label: str, polygons: Sequence[Any], name: str, texts: Sequence[str], facts: Row
+) -> Row:
+    """Return the feature of polygons; their role is in its facts, or in the texts."""
+    role = facts.get('role') or polygon_role(texts)
+    weight = facts.get('weight')
+    return feature_row(label, 'MultiPolygon', polygons, name=name, role=role, weight=weight)
+
+
 # ----------------------------------------------------------------------------- XML
 
 
@@ -174,9 +183,7 @@ def _kml(data: bytes, archive: Sequence[str] = ()) -> Iterator[Row]:
             else:
                 yield feature_row(label, shape.tag, name=name)
         if polygons:
-            role = facts.get('role') or polygon_role(texts)
-            weight = facts.get('weight')
-            yield feature_row(label, 'MultiPolygon', polygons, name=name, role=role, weight=weight)
+            yield polygons_row(label, polygons, name, texts, facts)
         if not shapes:
             yield feature_row(label, 'no geometry', name=name)
     others = [item for item in root.iter() if item.tag in _KML_OTHERS]

@@ -24,7 +24,7 @@ from maasi_filter.geometry.map_files import (
     check_size,
     feature_row,
     point_row,
-    polygon_role,
+    polygons_row,
 )
 from maasi_filter.geometry.polygons import short, warn
 from maasi_filter.wording import counted
@@ -231,9 +231,7 @@ def _rows(label: str, shape: BaseGeometry | None, facts: Row, layer: str) -> Ite
         else:
             yield feature_row(label, part.geom_type, name=name)
     if polygons:
-        role = facts.get('role') or polygon_role(texts)
-        weight = facts.get('weight')
-        yield feature_row(label, 'MultiPolygon', polygons, name=name, role=role, weight=weight)
+        yield polygons_row(label, polygons, name, texts, facts)
 
 
 def _parts(shape: BaseGeometry) -> Sequence[BaseGeometry]:

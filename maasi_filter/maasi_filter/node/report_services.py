@@ -78,7 +78,7 @@ class ReportServices:
             if target.id == request.id and target.id not in own:
                 raise ValueError(
                     f'id: read {target.id}, which {target.robot} found: allowed are targets of '
-                    'this filter; use the service of that one'
+                    f'this filter; use the service of the filter of {target.robot}'
                 )
         return review(request.id, request.confirmed, request.reliability, request.source, own)
 
