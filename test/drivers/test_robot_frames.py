@@ -204,7 +204,8 @@ def test_odometry_that_says_that_it_is_in_the_map_is_taken_as_that(play, capfd, 
     assert_allclose(pose_from_ros(team.state.pose.pose).position, odometry.position, atol=0.02)
     assert np.linalg.norm(odometry.position - team.start.position) > 0.1
     assert "odom: header.frame_id is 'map'" in capfd.readouterr().err
-    # It does not mix with odometry from the start.
+    # It does not mix with odometry from the start, once some messages have fixed the frame.
+    team.until(lambda: team.say() or len({state.step for state in team.states}) > 3)
     team.odometry_frame = 'odom'
     team.until(lambda: team.say() or driver.dropped['odometry'] > 3)
     assert "but previous messages were in 'map'" in capfd.readouterr().err

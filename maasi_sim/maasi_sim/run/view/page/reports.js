@@ -84,6 +84,17 @@ export class Reports {
     for (const button of this.buttons) button.setAttribute('aria-pressed', String(button.dataset.report === this.kind));
     this.panel.hidden = !this.kind;
     if (this.kind) this.fillPanel();
+    this.changed();
+  }
+
+  // Enable buttons by what is there at once, not with the next drawing: a click may come before it.
+  changed() {
+    if (this.kind) {
+      const problem = this.problem();
+      this.sender.disabled = Boolean(problem);
+      this.undo.disabled = !this.corners.length;
+      this.status.textContent = problem;
+    }
     this.page.request();
   }
 
@@ -93,7 +104,7 @@ export class Reports {
       const input = element('input');
       [input.name, input.type, input.step, input.min, input.value] = [name, 'number', 'any', '0', first];
       if (name === 'radius') input.value = number(0.05 * Math.max(...this.page.log.bounds.slice(0, 2).map(([low, high]) => high - low)));
-      input.oninput = () => this.page.request();
+      input.oninput = () => this.changed();
       const label = element('label', '', `${title} `);
       label.title = words;
       label.append(input);
@@ -102,7 +113,7 @@ export class Reports {
     this.undo = element('button', '', 'Undo');
     this.undo.onclick = () => {
       this.corners.pop();
-      this.page.request();
+      this.changed();
     };
     this.sender = element('button', '', 'Send');
     this.sender.dataset.report = 'send';
@@ -119,7 +130,7 @@ export class Reports {
     const corner = camera.ground(x, y, map.floor).slice(0, 2).map((value) => Number(value.toFixed(3)));
     if (this.kind === 'sighting') this.corners = [corner];
     else this.corners.push(corner);
-    this.page.request();
+    this.changed();
   }
 
   // Return what the statement lacks, or an empty text.
@@ -156,10 +167,6 @@ export class Reports {
   draw({ canvas, context, camera, floor }) {
     if (!this.kind) return;
     canvas.style.cursor = 'crosshair';
-    const problem = this.problem();
-    this.sender.disabled = Boolean(problem);
-    this.undo.disabled = !this.corners.length;
-    this.status.textContent = problem;
     context.lineWidth = 2.5;
     context.strokeStyle = this.kind === 'sighting' ? SIGHTED : VISITED;
     const places = this.corners.map(([x, y]) => [x, y, floor]);
