@@ -48,6 +48,8 @@ class Coordinator:
         }
         spacing, _ = map_spacing(self.area.bounds, sensors.values())
         self.exploration = UnexploredMap(self.area, settings.exploration_spacing or spacing)
+        # e after the searches of others alone, with which a search begins again.
+        self._by_others: UnexploredMap | None = None
         self.clusters: list[Cluster] = []
         self.finished: str | None = None
         self.planner = self._planner()
@@ -119,6 +121,8 @@ class Coordinator:
         self.area = self.exploration.area
         if self._open_share() > before + _ROUNDING:
             self._resume()
+        if self._by_others is not None:
+            self._by_others.adopt_area(area)
         for robot in self.robots.values():
             robot.adopt_area(area)
         self.homing.adopt_area()
@@ -130,7 +134,11 @@ class Coordinator:
 
     def use(self, report: Report) -> None:
         """Use a statement of a person as the filter did; a sighting resumes a finished search."""
-        maps = [self.exploration, *(robot.exploration for robot in self.robots.values())]
+        if report.kind == SEARCHED and self._by_others is None:
+            self._by_others = self.exploration.copy()
+            self._by_others.values[...] = 1.0
+        maps = [self.exploration, self._by_others]
+        maps += [robot.exploration for robot in self.robots.values()]
         if report.kind == SIGHTING:
             self.area = self.area.with_sightings((*self.area.sightings, sighting_of(report)))
             self._resume()
@@ -145,13 +153,14 @@ class Coordinator:
                 exploration.area = self.area
 
     def begin_again(self) -> None:
-        """Begin a new search with nothing explored; decision indices continue."""
-        self.exploration.values[...] = 1.0
+        """Begin a new search: only what others searched is explored; decision indices continue."""
+        before = 1.0 if self._by_others is None else self._by_others.values
+        self.exploration.values[...] = before
         self.clusters = []
         self.finished, self._ended, self._unasked = None, False, set()
         self.planner = self._planner()
         for robot in self.robots.values():
-            robot.begin_again()
+            robot.begin_again(before)
         self.homing.begin_again()
 
     def plan(

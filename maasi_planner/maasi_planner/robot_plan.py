@@ -181,12 +181,12 @@ class PlannedRobot:
         if self.exploration is not None:
             self.exploration.adopt_area(area)
 
-    def begin_again(self) -> None:
-        """Begin a new search with nothing explored; decision indices continue."""
+    def begin_again(self, exploration: FloatArray | float) -> None:
+        """Begin a new search with an exploration function; decision indices continue."""
         self.clear_plan()
         self.schedule.begin_again()
         if self.exploration is not None:
-            self.exploration.values[...] = 1.0
+            self.exploration.values[...] = exploration
         if self.endurance is not None:
             self.endurance.begin_again()
 

@@ -2,9 +2,12 @@
 
 import numpy as np
 import pytest
+from std_srvs.srv import Trigger
 from test_coordinator import ROBOT, there
 from test_planner_node import running, update_of
 
+from maasi_filter.geometry.area import Area
+from maasi_filter.geometry.environment import EnvironmentSettings
 from maasi_filter.reports import Report
 from maasi_filter.ros.qos import LATCHED_ALL
 from maasi_msgs.msg import Report as ReportMessage
@@ -98,6 +101,47 @@ def test_keep_outs_that_change_leave_sightings_in_the_area():
     assert coordinator.area is coordinator.exploration.area
 
 
+@pytest.mark.parametrize('own', [False, True])
+def test_a_search_that_begins_again_keeps_what_others_searched_and_sightings(own):
+    """Without any measurement, a new search begins with e as before the first measurement."""
+    robots = {'a': FLYER, 'b': {**FLYER, 'start': [50.0, 50.0, 1.0]}}
+    settings = make('maasi', robots).settings
+    if own:
+        settings = settings.model_copy(
+            update={'planner': settings.planner.model_copy(update={'agent_exploration': 'own'})}
+        )
+    generator = np.random.default_rng(7)
+    for _ in range(10):
+        coordinator, untouched = Coordinator(settings), Coordinator(settings)
+        assert (coordinator.robots['a'].exploration is not None) == own
+        for _ in range(5):
+            x, y = generator.uniform(5.0, 55.0, 2)
+            if generator.uniform() < 0.5:
+                report = searched(f'{x} {y} 12', generator.uniform(0.2, 0.9))
+            else:
+                report = Report('sighting', 1.0, position=[x, y], radius=6.0)
+            coordinator.use(report)
+            untouched.use(report)
+            pose = there(a=generator.uniform(5.0, 55.0, 2))['a'].state.pose
+            coordinator.absorb({'a': pose, 'b': pose}, [])
+        coordinator.begin_again()
+        for one, other in zip(maps_of(coordinator), maps_of(untouched), strict=True):
+            np.testing.assert_allclose(one.values, other.values, rtol=0.0, atol=1e-12)
+        # Keep-outs that change later apply to both.
+        environment = {**dict(settings.environment), 'keep_outs': ['20 20 9']}
+        closed = Area(EnvironmentSettings.model_validate(environment))
+        for team in (coordinator, untouched):
+            team.adopt_area(closed)
+        coordinator.begin_again()
+        for one, other in zip(maps_of(coordinator), maps_of(untouched), strict=True):
+            np.testing.assert_allclose(one.values, other.values, rtol=0.0, atol=1e-12)
+
+
+def maps_of(coordinator):
+    robots = coordinator.robots.values()
+    return [coordinator.exploration, *(item.exploration for item in robots if item.exploration)]
+
+
 def report_of(number, **changes):
     message = ReportMessage(id=number, kind=ReportMessage.SEARCHED, weight=0.5, zone='0.5 0.5 0.2')
     message.header.frame_id = 'map'
@@ -123,6 +167,18 @@ def test_running_freely_reports_are_used_once_and_wrong_ones_are_dropped():
         message.header.frame_id = 'odom'
         publisher.publish(message)
         team.until(lambda: team.tested.dropped['bad report'] == 5)
+        np.testing.assert_array_equal(e.values, once)
+        # A search that begins again after its end, too.
+        planner = team.tested.coordinator
+        planner.absorb({'a': there(a=(1.0, 1.0))['a'].state.pose}, [])
+        assert (e.values != once).any()
+        planner.finished = 'no further finds'
+        team.tested.modes.command('stop')
+        client = team.node.create_client(Trigger, 'search/start')
+        team.until(client.service_is_ready)
+        answer = client.call_async(Trigger.Request())
+        team.until(answer.done)
+        assert answer.result().success
         np.testing.assert_array_equal(e.values, once)
         # A planner that begins again uses it again, until a new search clears it.
         team.tested.reset()
