@@ -5,10 +5,12 @@ The equations are in `docs/filter.md`, section "Statements of people".
 
 from __future__ import annotations
 
+import json
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import shapely
@@ -18,7 +20,10 @@ from shapely.geometry.base import BaseGeometry
 from maasi_filter.arrays import FloatArray
 from maasi_filter.geometry.area import Area, Sighting, how_far, level_shape
 from maasi_filter.geometry.environment import EnvironmentSettings, Zone
-from maasi_filter.geometry.readers import shapes_of_texts
+from maasi_filter.geometry.geodesy import OriginSettings, to_map
+from maasi_filter.geometry.geojson import check_degrees
+from maasi_filter.geometry.polygons import is_wkt
+from maasi_filter.geometry.readers import read_shape, shapes_of_texts
 from maasi_filter.wording import number as shown
 from maasi_filter.wording import problems
 
@@ -35,6 +40,7 @@ MOST_WEIGHT = 1000.0  # expected targets of one sighting
 MOST_REPORTS = 1000  # in one search
 MOST_SOURCE = 100  # characters
 CORNERS = 2000  # of a searched zone
+GEOGRAPHIC = 'wgs84'  # frame of longitudes and latitudes [degrees]
 _FARTHEST = 4e7  # coordinate of a corner [m]
 # Largest probability of detection for potential targets, as for sensors.
 MOST_PROBABLE = 0.98
@@ -132,6 +138,51 @@ def review(
     return Report(CONFIRMED if confirmed else REJECTED, value, _source(source), target=number)
 
 
+def origin_of(
+    frame: str, map_frame: str, environment: EnvironmentSettings
+) -> OriginSettings | None:
+    """Return the origin if positions are geographic, None if they are in the map.
+
+    ValueError names another frame, or that there is no origin.
+    """
+    if frame.lower() == GEOGRAPHIC:
+        if environment.origin is None:
+            raise ValueError(f'frame_id: read {frame}, which needs environment.origin')
+        return environment.origin
+    if frame not in ('', map_frame):
+        raise ValueError(
+            f'frame_id: read {frame}, allowed are {map_frame} [m] and {GEOGRAPHIC} [degrees]'
+        )
+    return None
+
+
+def position_on_map(
+    longitude: float, latitude: float, origin: OriginSettings, field: str = 'position'
+) -> tuple[float, float]:
+    """Return a geographic position [degrees] in metres of the map; ValueError if it is none."""
+    degrees = np.array([[longitude, latitude]])
+    if not np.isfinite(degrees).all():
+        raise ValueError(f'{field}: read ({longitude:g}, {latitude:g}), allowed are numbers')
+    check_degrees(degrees, field)
+    x, y = to_map(degrees, origin)[0].round(4).tolist()
+    return x, y
+
+
+def zone_on_map(zone: str, origin: OriginSettings) -> str:
+    """Return a zone whose coordinates are longitude and latitude [degrees] as text for the map."""
+    shape = _shape_of(zone)
+    try:
+        if isinstance(shape, str) and not is_wkt(shape):
+            longitude, latitude, *others = map(float, shape.split())
+            x, y = position_on_map(longitude, latitude, origin, 'zone')
+            return ' '.join(map(repr, [x, y, *others]))
+        if not isinstance(shape, Mapping):
+            shape = json.loads(shapely.to_geojson(read_shape(shape)))
+        return str(read_shape(shape, origin))
+    except ValueError as error:
+        raise ValueError(f'zone: {str(error).removeprefix("zone: ")}') from None
+
+
 def sighting(
     position: Sequence[float], radius: float, weight: float, source: str, area: Area
 ) -> Report:
@@ -166,11 +217,9 @@ def searched(
         raise ValueError(
             f'detection_probability: read {probability:g}, allowed are numbers above 0, to 1'
         )
-    corners = max(zone.count(','), len(zone) // 50)
-    if corners > CORNERS:
-        raise ValueError(f'zone: read about {corners} corners, allowed are {CORNERS}')
+    shape = _shape_of(zone)
     try:
-        values = {**dict(environment), 'keep_outs': shapes_of_texts([zone])}
+        values = {**dict(environment), 'keep_outs': [shape]}
         zones = EnvironmentSettings.model_validate(values).keep_outs
     except ValueError as error:
         text = problems(error) if isinstance(error, ValidationError) else str(error)
@@ -179,8 +228,7 @@ def searched(
         raise ValueError('zone: read nothing, allowed is a polygon or x y radius')
     if any((zone.radius or 0.0) > _FARTHEST for zone in zones):
         raise ValueError(f'zone: read a radius beyond {_FARTHEST:g} m')
-    shapes = list(map(level_shape, zones))
-    shape = shapely.union_all(shapes)
+    shape = shapely.union_all(list(map(level_shape, zones)))
     if not np.abs(shape.bounds).max() <= _FARTHEST:
         raise ValueError(f'zone: read coordinates beyond {_FARTHEST:g} m')
     gap = float(area.border.distance(shape))
@@ -191,6 +239,17 @@ def searched(
     text = str(zones[0]) if len(zones) == 1 else str(shape)
     inner = area.border.intersection(shape).representative_point()
     return Report(SEARCHED, probability, _source(source), position=[inner.x, inner.y], zone=text)
+
+
+def _shape_of(zone: str) -> Any:
+    """Return the shape of a received text; ValueError if it is none."""
+    corners = max(zone.count(','), len(zone) // 50)
+    if corners > CORNERS:
+        raise ValueError(f'zone: read about {corners} corners, allowed are {CORNERS}')
+    try:
+        return shapes_of_texts([zone])[0]
+    except ValueError as error:
+        raise ValueError(f'zone: {_KEY.sub("", str(error))}') from None
 
 
 def _source(text: str) -> str:

@@ -4,8 +4,10 @@ import math
 
 import numpy as np
 import pytest
+from test_filter_node import SETTINGS as FILTER_SETTINGS
 from test_filter_node import running
 
+from maasi_filter.geometry.geodesy import OriginSettings, geodetic
 from maasi_filter.records import FoundTarget
 from maasi_filter.ros.qos import LATCHED_ALL
 from maasi_msgs.msg import Report
@@ -160,6 +162,31 @@ def test_bad_statements_are_refused_by_name(name, fields, text):
         assert answer.message.startswith(text)
         assert team.tested.filter.reports == []
         team.see(1)
+
+
+def test_statements_in_degrees_are_those_in_metres():
+    origin = OriginSettings(latitude=46.6, longitude=9.9)
+    environment = FILTER_SETTINGS.environment.model_copy(update={'origin': origin})
+    ((latitude, longitude, _),) = geodetic(np.array([[1.5, 0.5]]), origin)
+    with running(environment=environment) as team:
+        reports = team.collect(Report, 'reports', LATCHED_ALL)
+        place = {**SIGHTING, 'position': (longitude, latitude), 'frame_id': 'wgs84'}
+        assert ask(team, 'add_sighting', **place).success
+        zone = f'{longitude} {latitude} 0.3'
+        answer = ask(team, 'mark_searched', **{**SEARCHED, 'zone': zone}, frame_id='wgs84')
+        assert answer.success
+        team.until(lambda: len(reports) == 2)
+        place_used = [reports[0].position.x, reports[0].position.y]
+        zone_used = [float(word) for word in reports[1].zone.split()]
+        assert [*place_used, *zone_used] == pytest.approx([1.5, 0.5, 1.5, 0.5, 0.3], abs=2e-4)
+        swapped = {**place, 'position': (latitude, longitude)}
+        answer = ask(team, 'add_sighting', **swapped)
+        assert not answer.success and answer.message.startswith('position: read (')
+    with running() as team:
+        answer = ask(team, 'add_sighting', **place)
+        assert answer.message == 'frame_id: read wgs84, which needs environment.origin'
+        answer = ask(team, 'mark_searched', **SEARCHED, frame_id='odom')
+        assert answer.message == 'frame_id: read odom, allowed are map [m] and wgs84 [degrees]'
 
 
 def test_random_requests_never_stop_the_node():

@@ -1,5 +1,6 @@
 """Statements of persons change a filter as their equations say, and never break it."""
 
+import json
 import math
 
 import numpy as np
@@ -18,6 +19,7 @@ from maasi_filter import (
 )
 from maasi_filter.geometry.area import Area
 from maasi_filter.geometry.environment import EnvironmentSettings
+from maasi_filter.geometry.geodesy import OriginSettings, geodetic
 from maasi_filter.make_filter import make_filter
 from maasi_filter.reports import (
     CONFIRMED,
@@ -25,10 +27,13 @@ from maasi_filter.reports import (
     REJECTED,
     Report,
     believed,
+    origin_of,
+    position_on_map,
     review,
     searched,
     sighting,
     sighting_of,
+    zone_on_map,
 )
 from maasi_filter.unexplored_map import UnexploredMap
 
@@ -343,3 +348,59 @@ def test_random_statements_leave_everything_finite(settings, seed):
 )
 def test_a_report_is_a_sentence_for_people(report, text):
     assert str(report) == text
+
+
+@pytest.mark.parametrize('seed', range(20))
+def test_geographic_positions_and_zones_are_those_of_the_map(seed):
+    """Each text in degrees gives the shape in metres; the origin may be next to 180 degrees."""
+    rng = np.random.default_rng(seed)
+    origin = OriginSettings(latitude=rng.uniform(-70, 70), longitude=rng.choice([9.5, 179.9999]))
+    corners = np.array([[10.0, 10.0], [60.0, 15.0], [45.0, 80.0]]) + rng.uniform(-5, 5, (3, 2))
+    degrees = geodetic(corners, origin)[:, 1::-1]
+    x, y = degrees[0]
+    assert position_on_map(x, y, origin) == pytest.approx(corners[0], abs=1e-3)
+    centre, radius = zone_on_map(f'{x} {y} 12', origin).rsplit(' ', 1)
+    assert [float(word) for word in centre.split()] == pytest.approx(corners[0], abs=1e-3)
+    assert float(radius) == 12.0
+    shape = shapely.Polygon(np.unwrap(degrees, period=360.0, axis=0))
+    ring = [*shape.exterior.coords]
+    environment = EnvironmentSettings(**FIELD, origin=origin)
+    for text in (str(shape), json.dumps(ring), shapely.to_geojson(shape)):
+        zone = zone_on_map(text, origin)
+        # Straight edges in degrees bend by less than this on the map.
+        assert shapely.from_wkt(zone).hausdorff_distance(shapely.Polygon(corners)) < 1e-2
+        report = searched(zone, 0.5, '', environment, Area(environment))
+        assert report.shape.area == pytest.approx(shapely.Polygon(corners).area, rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    ('frame', 'text'),
+    [
+        ('odom', 'frame_id: read odom, allowed are map [m] and wgs84 [degrees]'),
+        ('wgs84', 'frame_id: read wgs84, which needs environment.origin'),
+    ],
+)
+def test_other_frames_are_refused(frame, text):
+    environment = EnvironmentSettings(**FIELD)
+    with pytest.raises(ValueError) as caught:
+        origin_of(frame, 'map', environment)
+    assert str(caught.value) == text
+    assert origin_of('', 'map', environment) is origin_of('map', 'map', environment) is None
+
+
+@pytest.mark.parametrize(
+    ('zone', 'text'),
+    [
+        ('500 46 30', 'zone: read longitude 500, latitude 46, allowed are 180 and 90 degrees'),
+        ('nan 46 30', "zone: got 'nan 46 30', allowed are"),
+        ('POLYGON ((9 146, 9.1 146, 9.1 146.1, 9 146))', 'zone: feature 1: read longitude 9'),
+        ('[[9, 46], [9.1, 46]]', 'zone: read [[9, 46], [9.1, 46]], allowed are at least 3'),
+        ('POLYGON ((9 46, 9.1 46.1, 9.1 46, 9 46.1, 9 46))', 'zone: read POLYGON'),
+        ('{"type": "Point", "coordinates": [9, 46]}', 'zone: holds no polygon'),
+        ('[[9, 46], ' * 3000, 'zone: read about'),
+    ],
+)
+def test_wrong_zones_in_degrees_are_refused(zone, text):
+    with pytest.raises(ValueError) as caught:
+        zone_on_map(zone, OriginSettings(latitude=46.0, longitude=9.0))
+    assert str(caught.value).startswith(text)

@@ -5,7 +5,7 @@ import json
 import threading
 import urllib.error
 import urllib.request
-from contextlib import closing
+from contextlib import closing, contextmanager
 
 import cv2
 import numpy as np
@@ -16,6 +16,7 @@ from rclpy.executors import SingleThreadedExecutor
 from test_view_drawing import click
 from waiting import wait_until
 
+from maasi_filter.geometry.geodesy import OriginSettings, geodetic
 from maasi_msgs.srv import AddSighting, MarkSearched, ReviewTarget
 from maasi_sim.run.view.control_node import Control
 from maasi_sim.run.view.event_log import EventLog
@@ -26,6 +27,7 @@ from maasi_sim.run.view.server import Hub, ViewServer
 SCENE = {'name': 'test', 'robots': {}, 'bounds': [[0, 100], [0, 80]], 'expected_targets': 6.0}
 FOUND = [[1, 20.0, 30.0, 0.0, [1, 0, 0, 1, 0, 0], 'rover', 2.0]]
 FOUND += [[2, 60.0, 50.0, 0.0, [1, 0, 0, 1, 0, 0], 'rover', 3.0]]
+ORIGIN = OriginSettings(latitude=46.6, longitude=9.9, altitude=1800.0)
 EVENTS = [
     [0.0, 'robot', 'rover', [5.0, 5.0, 0.0, 0.0], 1.0, 1, ''],
     [3.0, 'found', '', FOUND],
@@ -57,14 +59,20 @@ class Commander:
         return True, 'it is counted'
 
 
-@pytest.fixture
-def served():
+@contextmanager
+def serving(**facts):
     commander = Commander()
-    hub = Hub({**SCENE, 'control': True})
+    hub = Hub({**SCENE, 'control': True, **facts})
     for event in EVENTS:
         hub.put(event)
     with closing(ViewServer(hub, 0, commander=commander)) as server:
         yield server, commander
+
+
+@pytest.fixture
+def served():
+    with serving() as served:
+        yield served
 
 
 def rows(shown):
@@ -132,6 +140,40 @@ def test_found_targets_have_buttons_and_the_map_takes_sightings_and_searched_gro
     zone = shapely.from_wkt(searched.fields['zone'])
     assert zone.hausdorff_distance(shapely.Polygon([corner[:2] for corner in ring])) < 2e-3
     assert searched.fields['detection_probability'] == 0.7
+
+
+@pytest.mark.parametrize('origin', [None, ORIGIN], ids=['metres', 'degrees'])
+def test_positions_can_be_typed(chromium, origin):
+    def text(*corners):
+        places = np.array(corners, dtype=float)
+        places = geodetic(places, origin)[:, :2] if origin else places
+        return '; '.join(', '.join(f'{value:.8f}' for value in place) for place in places)
+
+    ring = [(10, 10), (40, 10), (40, 40)]
+    with chromium() as shown, serving(origin=origin and origin.model_dump()) as (server, commander):
+        shown.open(server.address)
+        shown.until("document.querySelectorAll('#finds tr').length == 2")
+        shown.page.click('button[data-report=sighting]')
+        for wrong in ('here', '1', '1, 2, 3', text((1, 1), (2, 2)), ''):
+            shown.page.fill('#report input[name=corners]', wrong)
+            assert shown.page.is_disabled('#report button[data-report=send]')
+        shown.page.fill('#report input[name=corners]', text((70, 20)))
+        shown.page.click('#report button[data-report=send]')
+        shown.until("document.querySelector('#report').hidden")
+        shown.page.click('button[data-report=searched]')
+        shown.page.fill('#report input[name=corners]', text(*ring[:2]))
+        # A click adds a corner to those that were typed, and is shown as text.
+        *_, last = [click(shown, corner) for corner in ring[2:]]
+        written = shown.page.input_value('#report input[name=corners]')
+        places = [[float(word) for word in part.split(',')] for part in written.split(';')]
+        expected = geodetic(np.array([last[:2]]), origin)[0, :2] if origin else last[:2]
+        assert places[2] == pytest.approx(expected, abs=2e-3 if origin is None else 7e-8)
+        shown.page.click('#report button[data-report=send]')
+        shown.until("document.querySelector('#report').hidden")
+    sighting, searched = commander.requests
+    assert sighting.fields['position'] == pytest.approx((70.0, 20.0), abs=2e-3)
+    zone = shapely.from_wkt(searched.fields['zone'])
+    assert zone.hausdorff_distance(shapely.Polygon([*ring[:2], last[:2]])) < 5e-3
 
 
 def test_a_replay_shows_statements_without_buttons(chromium, tmp_path):

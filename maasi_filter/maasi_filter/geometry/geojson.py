@@ -274,14 +274,14 @@ def _feature(number: int, row: Mapping[str, Any], source: str) -> tuple[Feature 
     parts = list(_parts(row.get('geometry'), where)) or [('empty', None)]
     for kind, coordinates in parts:
         if kind == 'Point' and facts.get('role') in _POINT_ROLES:
-            _check_degrees(_position(coordinates, where), where)
+            check_degrees(_position(coordinates, where), where)
             continue
         if kind != 'Polygon' or not coordinates:
             left.append(f'{name}: {kind}')
             continue
         rings = _rings(coordinates, where)
         if facts.get('unit') != 'm':
-            _check_degrees(np.concatenate(rings), where)
+            check_degrees(np.concatenate(rings), where)
             rings = _short_way(rings, where)
         shapes.append(sound(Polygon(rings[0], rings[1:]), where, 'degrees'))
     if not shapes:
@@ -346,7 +346,7 @@ def _short_way(rings: Sequence[FloatArray], where: str) -> list[FloatArray]:
     return [np.column_stack([x - 360.0 * turn, ring[:, 1]]) for x, turn, ring in columns]
 
 
-def _check_degrees(degrees: FloatArray, where: str) -> None:
+def check_degrees(degrees: FloatArray, where: str) -> None:
     """Raise ValueError with the likely cause if coordinates are not in degrees."""
     x, y = degrees.T
     wrong = np.flatnonzero((np.abs(x) > 180.0 + _BEYOND) | (np.abs(y) > 90.0))

@@ -9,7 +9,16 @@ from typing import Any, Protocol
 from rclpy.duration import Duration
 from std_msgs.msg import Header
 
-from maasi_filter.reports import MOST_REPORTS, Report, review, searched, sighting
+from maasi_filter.reports import (
+    MOST_REPORTS,
+    Report,
+    origin_of,
+    position_on_map,
+    review,
+    searched,
+    sighting,
+    zone_on_map,
+)
 from maasi_filter.ros.conversions import report_to_ros, stamp_to_ros
 from maasi_filter.ros.lifecycle_node import LockstepLifecycleNode
 from maasi_filter.ros.node_settings import FilterNodeSettings
@@ -85,15 +94,18 @@ class ReportServices:
     def _sighting(self, request: Any) -> Report:
         at = request.position
         search, _ = self._search()
-        place = (at.x, at.y, at.z)
-        return sighting(place, request.radius, request.weight, request.source, search.area)
+        origin = origin_of(request.frame_id, self._frame, self._node.settings.environment)
+        position = (at.x, at.y, at.z)
+        if origin is not None:
+            position = (*position_on_map(at.x, at.y, origin), 0.0)
+        return sighting(position, request.radius, request.weight, request.source, search.area)
 
     def _searched(self, request: Any) -> Report:
         search, _ = self._search()
-        probability, settings = request.detection_probability, self._node.settings
-        return searched(
-            request.zone, probability, request.source, settings.environment, search.area
-        )
+        probability, environment = request.detection_probability, self._node.settings.environment
+        origin = origin_of(request.frame_id, self._frame, environment)
+        zone = request.zone if origin is None else zone_on_map(request.zone, origin)
+        return searched(zone, probability, request.source, environment, search.area)
 
     def _take(self, read: Callable[[Any], Report], request: Any, answer: _Response) -> _Response:
         try:

@@ -2,6 +2,7 @@
 
 import { SIGHTED, VISITED } from './colours.js';
 import { problemOf } from './drawing.js';
+import { inMap, onEarth } from './earth.js';
 import { send } from './live.js';
 import { circle, path } from './shapes.js';
 import { reportsAt } from './statements.js';
@@ -36,6 +37,21 @@ function findsOf(log, space, time) {
   const crops = new Map(log.slot('crop', space).events.map((crop) => [crop[3], crop[4]]));
   for (const row of rows) row.picture = crops.get(row.id);
   return rows.sort((one, other) => one.id - other.id);
+}
+
+// Return corners [m] as text: latitude and longitude if there is an origin.
+function asText(corners, origin) {
+  const words = ([x, y]) => (origin ? onEarth([x, y], origin).reverse().map((angle) => angle.toFixed(7)) : [x, y]).join(', ');
+  return corners.map(words).join('; ');
+}
+
+// Return the corners [m] of a text, or null.
+function fromText(text, origin) {
+  const pairs = text.split(';').map((part) => part.trim()).filter(Boolean).map((part) => part.split(/[\s,]+/).map(Number));
+  if (!pairs.every((pair) => pair.length === 2 && pair.every(Number.isFinite))) return null;
+  if (!origin) return pairs;
+  if (!pairs.every(([latitude, longitude]) => Math.abs(latitude) <= 90 && Math.abs(longitude) <= 180)) return null;
+  return pairs.map((pair) => inMap(pair.reverse(), origin).map((value) => Number(value.toFixed(3))));
 }
 
 function stateOfFind({ counts, reviews, robot, when }) {
@@ -110,33 +126,45 @@ export class Reports {
       label.append(input);
       return [input, label];
     });
-    this.undo = element('button', '', 'Undo');
-    this.undo.onclick = () => {
-      this.corners.pop();
+    const { origin } = this.page.log.scene;
+    this.typed = element('input');
+    this.typed.name = 'corners';
+    this.typed.oninput = () => {
+      this.corners = fromText(this.typed.value, origin) || [];
       this.changed();
     };
+    const written = element('label', '', `${origin ? 'latitude, longitude' : 'x, y [m]'}${this.kind === 'searched' ? '; ...' : ''} `);
+    written.append(this.typed);
+    this.undo = element('button', '', 'Undo');
+    this.undo.onclick = () => this.place(this.corners.slice(0, -1));
     this.sender = element('button', '', 'Send');
     this.sender.dataset.report = 'send';
     this.sender.onclick = () => this.sendPlaced();
     const cancel = element('button', '', 'Cancel');
     cancel.onclick = () => this.start(null);
     this.status = element('span', 'quiet', '');
-    this.panel.replaceChildren(hint, ...this.inputs.map(([, label]) => label), this.sender, this.undo, cancel, this.status);
+    this.panel.replaceChildren(hint, written, ...this.inputs.map(([, label]) => label), this.sender, this.undo, cancel, this.status);
   }
 
   // Add a corner, or move the position, to a point of the canvas.
   click(x, y) {
     const { camera, map } = this.page;
     const corner = camera.ground(x, y, map.floor).slice(0, 2).map((value) => Number(value.toFixed(3)));
-    if (this.kind === 'sighting') this.corners = [corner];
-    else this.corners.push(corner);
+    this.place(this.kind === 'sighting' ? [corner] : [...this.corners, corner]);
+  }
+
+  // Set the corners, and the field in which they can be typed.
+  place(corners) {
+    this.corners = corners;
+    this.typed.value = asText(corners, this.page.log.scene.origin);
     this.changed();
   }
 
   // Return what the statement lacks, or an empty text.
   problem() {
     const empty = this.inputs.find(([input]) => !(Number(input.value) > 0));
-    if (this.kind === 'sighting' && !this.corners.length) return 'no position yet';
+    if (this.typed.value.trim() && !this.corners.length) return 'allowed are two numbers, of corners in rows with ;';
+    if (this.kind === 'sighting' && this.corners.length !== 1) return 'allowed is one position';
     const ring = this.kind === 'searched' ? problemOf(this.corners) : '';
     return ring || (empty ? `${empty[0].name.replace('_', ' ')}: allowed are numbers above 0` : '');
   }
