@@ -7,6 +7,7 @@ import pytest
 
 from maasi_sim.scenario.layering import ScenarioError
 from maasi_sim.scenario.loading import load_scenario, scenario_from_values
+from maasi_sim.scenario.preflight import preflight
 from maasi_sim.simulation.robots import Simulation
 
 MAVLINK = {'arm': True, 'url': 'udpin:127.0.0.1:14577'}
@@ -46,3 +47,31 @@ def test_robots_and_targets_are_at_heights_above_the_ground():
     moved = simulation.robots['rover'].state.pose.position
     assert np.linalg.norm(moved[:2]) > 5.0
     assert abs(moved[2] - 1.5 - terrain.height([0.0, 0.0])) > 0.5
+
+
+@pytest.mark.parametrize('seed', range(5))
+def test_the_estimate_describes_the_terrain(tmp_path, seed):
+    generator = np.random.default_rng(seed)
+    step, low = float(generator.integers(4, 40)), float(generator.integers(-300, 300))
+    columns, rows = (int(560.0 / step) + generator.integers(3, 9, 2)).tolist()
+    heights = low + generator.uniform(1.0, 90.0, (rows, columns))
+    heights[0, 0], heights[-1, -1] = low, low + 100.0
+    west = -0.5 * step * (columns - 1)
+    south = -0.5 * step * (rows - 1)
+    head = f'ncols {columns}\nnrows {rows}\nxllcenter {west}\nyllcenter {south}\ncellsize {step}\n'
+    body = '\n'.join(' '.join(map(str, row)) for row in heights)
+    (tmp_path / 'ground.asc').write_text(head + body)
+    values = deepcopy(load_scenario('hills').content())
+    values['environment']['terrain'] = str(tmp_path / 'ground.asc')
+    (line,) = (
+        line
+        for line in preflight(scenario_from_values(values, 'test')).lines
+        if line.startswith('terrain: ')
+    )
+    assert line == (
+        f'terrain: ground.asc, {step * columns:.3g} m x {step * rows:.3g} m, '
+        f'heights {low:g} to {low + 100.0:g} m above z = 0, cells of {step:g} m'
+    )
+    del values['environment']['terrain']
+    flat = preflight(scenario_from_values(values, 'test')).lines
+    assert not any('terrain' in line for line in flat)

@@ -7,6 +7,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import lru_cache
+from pathlib import Path
 
 import numpy as np
 import shapely
@@ -14,6 +15,7 @@ from shapely.geometry.base import BaseGeometry
 
 from maasi_filter.geometry.area import Area, level_shape
 from maasi_filter.geometry.geodesy import OriginSettings
+from maasi_filter.geometry.terrain import Terrain
 from maasi_filter.wording import number
 from maasi_planner.candidates import half_view, map_spacing, swath_of
 from maasi_sim.scenario.free_space import FreeSpace
@@ -104,6 +106,8 @@ def preflight(scenario: Scenario) -> Preflight:
         report.lines.append(f'{name}: {_pass_of(effort, ground.area * height)}')
     team = _add_team(report, efforts, together.area * height, scenario.limits.time)
     _add_cells(report, scenario, area)
+    if area.terrain is not None:
+        report.lines.append(_terrain_of(Path(str(scenario.environment.terrain.file)), area.terrain))
     # A strip along a wall is not a part.
     strip = 0.1 * min(effort.swath for effort in efforts.values())
     missed = ground.difference(together).buffer(-strip, join_style='mitre')
@@ -238,6 +242,18 @@ def _add_cells(report: Preflight, scenario: Scenario, area: Area) -> None:
     )
     if warning:
         report.warnings.append(warning)
+
+
+def _terrain_of(file: Path, terrain: Terrain) -> str:
+    surface = terrain.surface
+    # Without the outer nodes, which level the outermost half cells.
+    cells = np.array(surface.heights.shape) - 2
+    size = ' x '.join(map(_metres, (cells * surface.step).tolist()))
+    step = ' x '.join(dict.fromkeys(map(_metres, surface.step.tolist())))
+    return (
+        f'terrain: {file.name}, {size}, heights {number(surface.lowest)} to '
+        f'{number(surface.highest)} m above z = 0, cells of {step}'
+    )
 
 
 def _add_parts(report: Preflight, missed: BaseGeometry, whole: float) -> None:
