@@ -1,8 +1,10 @@
-# Sets up what is missing (virtual environment, ROS 2 Jazzy wheels, build of all packages) and
+# Sets up what is missing (virtual environment, ROS 2 wheels, build of all packages) and
 # exports the environment in which the commands run. Sourced by the commands in this folder.
 #   PYTHON            interpreter to use (3.10 to 3.14)
+#   MAASI_ROS_DISTRO  ROS 2 to use (default: the sourced one, otherwise jazzy)
 #   MAASI_REQUIREMENTS   folder of requirements*.txt (default: the repository)
-#   MAASI_WORKSPACE   where environment and build go (default: .workspace in the repository)
+#   MAASI_WORKSPACE   where environment and build go (default: .workspace in the repository;
+#                     .workspace/kilted for kilted)
 
 # The help of a command answers before anything is set up.
 case "${1:-}" in
@@ -14,9 +16,6 @@ case "${1:-}" in
 esac
 
 maasi_root="$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)"
-maasi_workspace="${MAASI_WORKSPACE:-$maasi_root/.workspace}"
-case "$maasi_workspace" in /*) ;; *) maasi_workspace="$PWD/$maasi_workspace" ;; esac
-maasi_venv="$maasi_workspace/venv"
 maasi_requirements="${MAASI_REQUIREMENTS:-$maasi_root}"
 
 maasi_fail() {
@@ -40,36 +39,60 @@ print(sys.executable)' 2> /dev/null && return
 
 maasi_hash() { sha256sum | cut -d ' ' -f 1; }
 
-# A sourced Jazzy is used as it is, the wheels only where there is none.
-maasi_has_jazzy() {
-  [ "${ROS_DISTRO:-}" = jazzy ] && [ -z "${MAASI_WHEELS:-}" ] && "$1" -c 'import rclpy' 2> /dev/null
+# Prints the distribution of ROS 2, and `sourced` or `wheels`. A sourced one is used as it is, the
+# wheels only where there is none, or an older one that was not asked for.
+maasi_choose_ros() {
+  local distro="${MAASI_ROS_DISTRO:-${ROS_DISTRO:-jazzy}}"
+  if [ "$distro" = "${ROS_DISTRO:-}" ] && [ -z "${MAASI_WHEELS:-}" ] \
+      && "$1" -c 'import rclpy' 2> /dev/null; then
+    if [ "$distro" = jazzy ] || [ "$distro" = kilted ]; then
+      echo "$distro sourced"
+      return
+    fi
+    if [ -n "${MAASI_ROS_DISTRO:-}" ] || [[ "$distro" > kilted ]]; then
+      echo "warning: using the sourced ROS 2 $distro; tested are jazzy and kilted" >&2
+      echo "$distro sourced"
+      return
+    fi
+    echo "warning: the sourced ROS 2 $distro is older than jazzy: using jazzy from PyPI" \
+      "(MAASI_ROS_DISTRO=$distro uses the sourced one)" >&2
+  fi
+  case "$distro" in
+    jazzy|kilted) ;;
+    *)
+      [ -z "${MAASI_ROS_DISTRO:-}" ] || maasi_fail "MAASI_ROS_DISTRO=$distro: $1 finds no such ROS 2" \
+        "source it (/opt/ros/$distro/setup.bash), or set jazzy or kilted, which are installed from PyPI"
+      distro=jazzy
+      ;;
+  esac
+  echo "$distro wheels"
 }
 
 maasi_make_venv() {
-  local python="$1" mode="$2" key="$3"
+  local python="$1" key="$2"
   local requirements=(-r "$maasi_requirements/requirements.txt" -r "$maasi_requirements/requirements-build.txt")
   local log="$maasi_workspace/setup.log"
   "$python" -c 'import venv, ensurepip' 2> /dev/null \
     || maasi_fail "$python has no venv module" 'install it: sudo apt install python3-venv'
   rm -rf "$maasi_venv" "$maasi_workspace/build" "$maasi_workspace/install"
   mkdir -p "$maasi_workspace"
-  if [ "$mode" = jazzy ]; then
-    echo "Setting up: Python packages for the sourced ROS 2 Jazzy (downloads about 150 MB) ..." >&2
+  if [ "$maasi_mode" = sourced ]; then
+    echo "Setting up: Python packages for the sourced ROS 2 ${maasi_distro^} (downloads about 150 MB) ..." >&2
     "$python" -m venv --system-site-packages "$maasi_venv"
-    # The messages of the sourced Jazzy are compiled against its NumPy: keep that version.
+    # The messages of the sourced ROS 2 are compiled against its NumPy: keep that version.
     "$python" -c 'import numpy; print("numpy==" + numpy.__version__)' \
       > "$maasi_workspace/constraints.txt"
     requirements+=(-c "$maasi_workspace/constraints.txt")
   else
-    echo "Setting up: ROS 2 Jazzy and Python packages as wheels (downloads about 250 MB) ..." >&2
+    echo "Setting up: ROS 2 ${maasi_distro^} and Python packages as wheels (downloads about 250 MB) ..." >&2
     "$python" -m venv "$maasi_venv"
-    requirements+=(-r "$maasi_requirements/requirements-ros.txt")
+    requirements+=(-r "$maasi_requirements/requirements-$maasi_distro.txt")
   fi
   if ! "$maasi_venv/bin/python" "$maasi_root/scripts/install.py" "${requirements[@]}" > "$log" 2>&1; then
     tail -n 15 "$log" >&2
     maasi_fail "installing the Python packages failed; the whole log: $log"
   fi
-  [ "$mode" = jazzy ] || "$maasi_venv/bin/python" "$maasi_root/scripts/mend_wheels.py"
+  [ "$maasi_mode" = sourced ] || "$maasi_venv/bin/python" "$maasi_root/scripts/mend_wheels.py"
   echo "$key" > "$maasi_venv/.maasi_key"
 }
 
@@ -160,18 +183,20 @@ maasi_compile() {
 # Does what is missing, in a shell of its own: an error does not close the shell of a user.
 maasi_set_up() (
   set +e
-  local python="$1" mode="$2" key compiling='' kernels
+  local python="$1" key compiling='' kernels
   if ! mkdir -p "$maasi_workspace" 2> /dev/null || ! [ -w "$maasi_workspace" ]; then
     maasi_fail "cannot write to $maasi_workspace" 'name a folder for it: MAASI_WORKSPACE=FOLDER'
   fi
   exec {maasi_lock}> "$maasi_workspace/lock"
   flock "$maasi_lock"
-  key="$( (cat "$maasi_requirements"/requirements.txt "$maasi_requirements"/requirements-build.txt \
-    "$maasi_requirements"/requirements-ros.txt "$maasi_root/scripts/mend_wheels.py"
-    "$python" -ISc 'import sys; print(sys.version, sys.base_prefix)'; echo "$mode $maasi_venv") | maasi_hash)"
+  key="$( (cat "$maasi_requirements"/requirements.txt "$maasi_requirements"/requirements-build.txt
+    if [ "$maasi_mode" = wheels ]; then cat "$maasi_requirements/requirements-$maasi_distro.txt"
+    else echo "$maasi_distro"; fi
+    cat "$maasi_root/scripts/mend_wheels.py"
+    "$python" -ISc 'import sys; print(sys.version, sys.base_prefix)'; echo "$maasi_mode $maasi_venv") | maasi_hash)"
   [ "$(cat "$maasi_venv/.maasi_key" 2> /dev/null)" = "$key" ] \
-    || maasi_make_venv "$python" "$mode" "$key"
-  maasi_use_venv "$mode"
+    || maasi_make_venv "$python" "$key"
+  maasi_use_venv
   kernels="$(maasi_kernels)"
   if maasi_needs_compiling "$kernels"; then
     maasi_compile "$kernels" &
@@ -190,9 +215,9 @@ maasi_set_up() (
 )
 
 maasi_use_venv() {
-  if [ "$1" = wheels ]; then
+  if [ "$maasi_mode" = wheels ]; then
     export AMENT_PREFIX_PATH="$maasi_venv" CMAKE_PREFIX_PATH="$maasi_venv"
-    export ROS_DISTRO=jazzy MAASI_WHEELS=1
+    export ROS_DISTRO="$maasi_distro" MAASI_WHEELS=1
     unset PYTHONPATH
   fi
   export PATH="$maasi_venv/bin:$PATH"
@@ -203,7 +228,7 @@ maasi_use_venv() {
 
 maasi_use() {
   local nounset=+u
-  maasi_use_venv "$1"
+  maasi_use_venv
   # The generated file reads unset variables.
   case $- in *u*) nounset=-u ;; esac
   set +u
@@ -218,7 +243,13 @@ maasi_use() {
   export NUMBA_CACHE_DIR
 }
 
-maasi_python="$(maasi_find_python)" || case $- in *i*) return 2 ;; *) exit 2 ;; esac
-if maasi_has_jazzy "$maasi_python"; then maasi_mode=jazzy; else maasi_mode=wheels; fi
-maasi_set_up "$maasi_python" "$maasi_mode" || case $- in *i*) return 2 ;; *) exit 2 ;; esac
-maasi_use "$maasi_mode"
+maasi_python="$(maasi_find_python)" && maasi_ros="$(maasi_choose_ros "$maasi_python")" \
+  || case $- in *i*) return 2 ;; *) exit 2 ;; esac
+maasi_distro="${maasi_ros% *}" maasi_mode="${maasi_ros#* }"
+maasi_workspace=.workspace
+[ "$maasi_distro" = jazzy ] || maasi_workspace=".workspace/$maasi_distro"
+maasi_workspace="${MAASI_WORKSPACE:-$maasi_root/$maasi_workspace}"
+case "$maasi_workspace" in /*) ;; *) maasi_workspace="$PWD/$maasi_workspace" ;; esac
+maasi_venv="$maasi_workspace/venv"
+maasi_set_up "$maasi_python" || case $- in *i*) return 2 ;; *) exit 2 ;; esac
+maasi_use

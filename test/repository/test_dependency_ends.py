@@ -36,4 +36,6 @@ def test_an_end_has_each_dependency_and_no_other_file_pins_it(tmp_path, end):
         assert operators == {'=='} if end == 'oldest' else '>=' in operators, name
     assert {path.name for path in ROOT.glob('requirements-*.txt')} == files.keys()
     assert not allowed.keys() & {item.name for items in files.values() for item in items}
-    assert any(item.name == 'ros-jazzy-rclpy' for item in files['requirements-ros.txt'])
+    for distro in ('jazzy', 'kilted'):
+        names = {item.name for item in files[f'requirements-{distro}.txt']}
+        assert f'ros-{distro}-rclpy' in names

@@ -51,7 +51,11 @@ def test_shell_runs_commands_and_executables_and_gives_their_exit_code(tmp_path)
     )
     result = call(SHELL, 'bash', '-c', script, folder=tmp_path)
     lines = result.stdout.splitlines()
-    assert (result.returncode, lines[0], lines[-3:]) == (7, 'jazzy', ['help 0', 'cut 0', 'wrong 2'])
+    assert (result.returncode, lines[0], lines[-3:]) == (
+        7,
+        os.environ['ROS_DISTRO'],
+        ['help 0', 'cut 0', 'wrong 2'],
+    )
     assert 'measurement_batch' in result.stdout
     line = result.stderr.splitlines()[-1]
     assert line.startswith('error: ') and 'none.yaml' in line
@@ -72,6 +76,51 @@ def test_an_environment_that_cannot_be_set_up_ends_a_script_but_no_interactive_s
         'error: cannot write to /proc/workspace',
         '  name a folder for it: MAASI_WORKSPACE=FOLDER',
     ]
+
+
+# MAASI_ROS_DISTRO, the sourced ROS 2 and whether Python finds its rclpy; answer and message.
+CHOICES = [
+    ('', '', False, 'jazzy wheels', ''),
+    ('', 'jazzy', True, 'jazzy sourced', ''),
+    ('', 'jazzy', False, 'jazzy wheels', ''),
+    ('', 'kilted', True, 'kilted sourced', ''),
+    ('', 'kilted', False, 'kilted wheels', ''),
+    ('kilted', '', False, 'kilted wheels', ''),
+    ('kilted', 'jazzy', True, 'kilted wheels', ''),
+    ('jazzy', 'kilted', True, 'jazzy wheels', ''),
+    ('kilted', 'kilted', True, 'kilted sourced', ''),
+    (
+        '',
+        'rolling',
+        True,
+        'rolling sourced',
+        'warning: using the sourced ROS 2 rolling; tested are',
+    ),
+    ('', 'humble', True, 'jazzy wheels', 'warning: the sourced ROS 2 humble is older than jazzy'),
+    ('', 'humble', False, 'jazzy wheels', ''),
+    ('humble', 'humble', True, 'humble sourced', 'warning: using the sourced ROS 2 humble; tested'),
+    ('humble', 'jazzy', True, '', 'error: MAASI_ROS_DISTRO=humble: python finds no such ROS 2'),
+    ('rolling', 'rolling', False, '', 'error: MAASI_ROS_DISTRO=rolling: python finds no such ROS'),
+]
+
+
+@pytest.mark.parametrize(('wanted', 'sourced', 'found', 'answer', 'message'), CHOICES)
+def test_the_distribution_of_ros_is_the_wanted_else_the_sourced_one(
+    wanted, sourced, found, answer, message
+):
+    text = (SCRIPTS / 'environment.bash').read_text()
+    functions = re.findall(r'^maasi_(?:fail|choose_ros)\(\) \{\n.*?^\}\n', text, re.M | re.S)
+    script = f'python() {{ {"true" if found else "false"}; }}\n{"".join(functions)}'
+    variables = {'MAASI_ROS_DISTRO': wanted, 'ROS_DISTRO': sourced}
+    result = call('bash', '-euc', f'{script}maasi_choose_ros python', MAASI_WHEELS='', **variables)
+    assert (result.stdout.strip(), result.returncode) == (answer, 0 if answer else 2)
+    assert result.stderr.startswith(message) and bool(result.stderr) == bool(message)
+    # Where wheels are in use, they stay so in a script that another one calls.
+    if sourced in ('jazzy', 'kilted') and not wanted:
+        result = call(
+            'bash', '-euc', f'{script}maasi_choose_ros python', MAASI_WHEELS='1', **variables
+        )
+        assert result.stdout == f'{sourced} wheels\n'
 
 
 COMMANDS = sorted(path.name for path in SCRIPTS.iterdir() if path.is_file() and not path.suffix)
