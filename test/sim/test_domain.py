@@ -18,6 +18,12 @@ from maasi_sim.run import domain as domain_module
 from maasi_sim.run.domain import Domain, DomainError, remove_dead
 
 SHARED = Path('/dev/shm')
+# Of Fast DDS 2.14 (Jazzy) and 3.2 (Kilted): beginning of file names, variable with the profiles.
+PREFIXES = ('fastrtps', 'fastdds')
+PROFILES = {
+    'jazzy': 'FASTRTPS_DEFAULT_PROFILES_FILE',
+    'kilted': 'FASTDDS_DEFAULT_PROFILES_FILE',
+}
 # First word of a port that its creator has made ready.
 READY = (2).to_bytes(4, sys.byteorder)
 NODE = """
@@ -30,6 +36,19 @@ subscription = node.create_subscription(Empty, 'beat', lambda _: print('received
 node.create_timer(0.05, lambda: publisher.publish(Empty()))
 rclpy.spin(node)
 """
+
+
+@pytest.fixture(params=PREFIXES)
+def prefix(request):
+    return request.param
+
+
+@pytest.fixture(params=PROFILES)
+def profiles(request, monkeypatch):
+    monkeypatch.setenv('ROS_DISTRO', request.param)
+    for name in PROFILES.values():
+        monkeypatch.delenv(name, raising=False)
+    return PROFILES[request.param]
 
 
 @pytest.fixture
@@ -55,7 +74,7 @@ def started():
         assert 'received\n' in iter(process.stdout.readline, '')
         maps = Path(f'/proc/{process.pid}/maps').read_text().split()
         opened = map(os.readlink, Path(f'/proc/{process.pid}/fd').iterdir())
-        yield process, {Path(file) for file in (*maps, *opened) if '/dev/shm/fastrtps' in file}
+        yield process, {Path(file) for file in (*maps, *opened) if '/dev/shm/fast' in file}
     finally:
         process.kill()
         process.wait(PATIENCE)
@@ -64,7 +83,7 @@ def started():
 
 def made(files):
     """Return what a node made, whose locks it holds; not ports and segments that it only opened."""
-    locks = {path for path in files if re.fullmatch(r'fastrtps_[0-9a-f]{16}_el', path.name)}
+    locks = {path for path in files if re.fullmatch(r'fast[a-z]+_[0-9a-f]{16}_el', path.name)}
     return locks | {path.with_name(path.name.removesuffix('_el')) for path in locks}
 
 
@@ -79,19 +98,19 @@ def test_files_of_a_killed_node_go_and_those_of_a_live_one_stay(domain):
         assert made(used) and all(path.exists() for path in made(used))
         assert 'received\n' in iter(live.stdout.readline, '')
         # A port is known by its mark.
-        ports = [path for path in used if re.fullmatch(r'fastrtps_port\d+', path.name)]
+        ports = [path for path in used if re.fullmatch(r'fast[a-z]+_port\d+', path.name)]
         assert ports
         for port in ports:
             with port.open('rb') as file:
                 assert file.read(4) == READY
-        numbers = {int(port.name.removeprefix('fastrtps_port')) for port in ports}
+        numbers = {int(port.name.partition('_port')[2]) for port in ports}
         # Those below 7400 are common to all domains.
         assert {(number - 7400) // 250 for number in numbers if number >= 7400} == {domain.number}
 
 
-def test_a_run_removes_them_at_its_start_and_at_its_end():
+def test_a_run_removes_them_at_its_start_and_at_its_end(prefix):
     def dead():
-        return SHARED / write(SHARED, f'fastrtps_port{os.getpid() + 10**6}').pop()
+        return SHARED / write(SHARED, f'{prefix}_port{os.getpid() + 10**6}').pop()
 
     def at_start():
         path = dead()
@@ -108,26 +127,28 @@ def test_a_run_removes_them_at_its_start_and_at_its_end():
     wait_until(at_end)
 
 
-def test_ports_that_were_ready_go_only_with_their_domain(folder):
+def test_ports_that_were_ready_go_only_with_their_domain(folder, prefix):
     # Domain 5 has the ports from 7400 + 5 * 250.
-    own = write(folder, 'fastrtps_port8650', 'fastrtps_port8899', content=READY + bytes(60))
-    own |= write(folder, 'fastrtps_port8650_el')
-    others = write(folder, 'fastrtps_port8900', content=READY + bytes(60))
-    others |= write(folder, 'fastrtps_port8900_el', 'fastrtps_port8902_el')
+    own = write(folder, f'{prefix}_port8650', f'{prefix}_port8899', content=READY + bytes(60))
+    own |= write(folder, f'{prefix}_port8650_el')
+    others = write(folder, f'{prefix}_port8900', content=READY + bytes(60))
+    others |= write(folder, f'{prefix}_port8900_el', f'{prefix}_port8902_el')
     assert remove_dead(folder=folder) == []
     assert set(remove_dead(5, folder)) == own
     assert {path.name for path in folder.iterdir()} == others
 
 
-def test_a_port_goes_as_a_whole_where_nobody_uses_a_part_of_it(folder):
-    dead = write(folder, 'fastrtps_port7411', 'fastrtps_port7411_el', 'sem.fastrtps_port7411_mutex')
-    dead |= write(folder, 'fastrtps_0017a085580e8ff0', 'fastrtps_0017a085580e8ff0_el')
-    mapped = write(folder, 'fastrtps_port7413', 'fastrtps_port7413_el')
-    opened = write(folder, 'fastrtps_0017a085580e8ff1', 'fastrtps_0017a085580e8ff1_el')
-    others = write(folder, 'fastrtps_notes', 'sem.others', 'fastrtps_port7411_copy')
-    with (folder / 'fastrtps_port7413').open('r+b') as file:
+def test_a_port_goes_as_a_whole_where_nobody_uses_a_part_of_it(folder, prefix):
+    dead = write(
+        folder, f'{prefix}_port7411', f'{prefix}_port7411_el', f'sem.{prefix}_port7411_mutex'
+    )
+    dead |= write(folder, f'{prefix}_0017a085580e8ff0', f'{prefix}_0017a085580e8ff0_el')
+    mapped = write(folder, f'{prefix}_port7413', f'{prefix}_port7413_el')
+    opened = write(folder, f'{prefix}_0017a085580e8ff1', f'{prefix}_0017a085580e8ff1_el')
+    others = write(folder, f'{prefix}_notes', 'sem.others', f'{prefix}_port7411_copy')
+    with (folder / f'{prefix}_port7413').open('r+b') as file:
         memory = mmap.mmap(file.fileno(), 64)
-    with (folder / 'fastrtps_0017a085580e8ff1_el').open('rb'):
+    with (folder / f'{prefix}_0017a085580e8ff1_el').open('rb'):
         assert set(remove_dead(folder=folder)) == dead
         assert {path.name for path in folder.iterdir()} == mapped | opened | others
     memory.close()
@@ -147,24 +168,21 @@ def test_what_another_user_put_there_is_left(folder, monkeypatch):
     assert remove_dead(folder=folder / 'missing') == []
 
 
-def test_beyond_the_participants_that_are_found_by_default_more_are_contacted(monkeypatch):
-    monkeypatch.delenv('FASTRTPS_DEFAULT_PROFILES_FILE', raising=False)
+def test_beyond_the_participants_that_are_found_by_default_more_are_contacted(profiles):
     with Domain() as domain:
         few, many = domain.environment(10), domain.environment(40)
         assert few['ROS_AUTOMATIC_DISCOVERY_RANGE'] == 'LOCALHOST'
         # The profile keeps it on this host.
         assert many['ROS_AUTOMATIC_DISCOVERY_RANGE'] == 'SYSTEM_DEFAULT'
-        file = Path(many['FASTRTPS_DEFAULT_PROFILES_FILE'])
+        file = Path(many[profiles])
         text = file.read_text()
         (contacted,) = re.findall(r'<maxInitialPeersRange>(\d+)<', text)
         assert int(contacted) > 40
         assert set(re.findall(r'<address>(.*?)</address>', text)) == {'127.0.0.1'}
-    assert Path(few['FASTRTPS_DEFAULT_PROFILES_FILE']).exists() and not file.exists()
+    assert Path(few[profiles]).exists() and not file.exists()
 
 
-def test_domains_are_not_shared_with_runs_or_other_nodes(monkeypatch):
-    profiles = 'FASTRTPS_DEFAULT_PROFILES_FILE'
-    monkeypatch.delenv(profiles, raising=False)
+def test_domains_are_not_shared_with_runs_or_other_nodes(profiles, monkeypatch):
     for number in (-1, 102):
         with pytest.raises(DomainError, match='0 to 101'):
             Domain(number)
@@ -177,8 +195,10 @@ def test_domains_are_not_shared_with_runs_or_other_nodes(monkeypatch):
             'ROS_DOMAIN_ID': str(first.number),
             'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
         }
-        monkeypatch.setenv(profiles, 'of the user')
-        assert profiles not in first.environment()
+        for name in PROFILES.values():
+            with monkeypatch.context() as patch:
+                patch.setenv(name, 'of the user')
+                assert not set(PROFILES.values()) & set(first.environment())
     # Of discovery, and of a participant that is seen on this host only.
     for port in (0, 10, 13, 119):
         with Domain() as domain:

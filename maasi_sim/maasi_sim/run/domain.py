@@ -15,9 +15,10 @@ from pathlib import Path
 from maasi_filter.ros.loopback import loopback_fault
 
 DOMAINS = range(0, 102)  # domains with ports below the ephemeral ports of Linux (from 32768)
-_PROFILES = 'FASTRTPS_DEFAULT_PROFILES_FILE'  # environment variable with the profiles of Fast DDS
-# Files of Fast DDS 2.14: ports, segments, their locks and semaphores.
-_NAME = re.compile(r'(?:sem\.)?(fastrtps_(?:port\d+|[0-9a-f]{16}))(?:_el|_sl|_mutex)?')
+# Environment variables with the profiles: of Fast DDS 3, and of Fast DDS 2 (Jazzy and before).
+_PROFILES = ('FASTDDS_DEFAULT_PROFILES_FILE', 'FASTRTPS_DEFAULT_PROFILES_FILE')
+# Files of Fast DDS 2.14 and 3.2: ports, segments, their locks and semaphores.
+_NAME = re.compile(r'(?:sem\.)?(fast(?:rtps|dds)_(?:port(\d+)|[0-9a-f]{16}))(?:_el|_sl|_mutex)?')
 # Ports of the RTPS specification: number per domain, and first one.
 FIRST_PORT, PORTS_PER_DOMAIN = 7400, 250
 # Fast DDS contacts 32 participants per host, unless its profile says otherwise; some are programs
@@ -93,10 +94,11 @@ class Domain(contextlib.AbstractContextManager['Domain']):
             'ROS_DOMAIN_ID': str(self.number),
             'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
         }
-        if _PROFILES in os.environ:
+        if any(name in os.environ for name in _PROFILES):
             return variables
+        profiles = _PROFILES[os.environ.get('ROS_DISTRO', 'jazzy') <= 'jazzy']
         if participants + _OTHERS <= _FOUND:
-            variables[_PROFILES] = str(Path(__file__).with_name('discovery.xml'))
+            variables[profiles] = str(Path(__file__).with_name('discovery.xml'))
             return variables
         # rmw_fastrtps replaces the transports of a profile unless the range is the default one.
         variables['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'SYSTEM_DEFAULT'
@@ -105,7 +107,7 @@ class Domain(contextlib.AbstractContextManager['Domain']):
         with tempfile.NamedTemporaryFile('w', prefix='maasi_', suffix='.xml', delete=False) as file:
             self._files.callback(Path(file.name).unlink, missing_ok=True)
             file.write(text)
-        variables[_PROFILES] = file.name
+        variables[profiles] = file.name
         return variables
 
     def release(self) -> None:
@@ -155,8 +157,9 @@ def remove_dead(domain: int | None = None, folder: Path = Path('/dev/shm')) -> l
 
 
 def _may_go(path: Path, domain: int | None) -> bool:
-    number = path.name.removeprefix('fastrtps_port')
-    if number == path.name:
+    match = _NAME.fullmatch(path.name)
+    number = match and match[2]
+    if number is None:
         return True
     if domain is not None and (int(number) - FIRST_PORT) // PORTS_PER_DOMAIN == domain:
         return True
