@@ -1,9 +1,11 @@
 """Launch a search in Gazebo: ros2 launch maasi_sim gazebo.launch.py world:=FILE.sdf scenario:=FILE.
 
 Starts `gz sim` with a world that `run_scenario FILE --write-world FILE.sdf` wrote, the bridge with
-the file next to it, and the run, with the arguments of scenario.launch.py. Ends with the run.
+the file next to it, and the run, with the arguments of scenario.launch.py. Ends with the first of
+them that ends.
 """
 
+import shutil
 from pathlib import Path
 
 from launch import LaunchContext, LaunchDescription
@@ -12,6 +14,7 @@ from launch.actions import (
     ExecuteProcess,
     IncludeLaunchDescription,
     OpaqueFunction,
+    Shutdown,
 )
 from launch.launch_description_sources import PythonLaunchDescriptionSource
 from launch.substitutions import LaunchConfiguration
@@ -30,9 +33,15 @@ def start_world(context: LaunchContext) -> list:
             raise RuntimeError(
                 f'world: {file} is missing; run_scenario FILE --write-world {world} writes it'
             )
+    # First, so that nothing starts where it is not installed.
+    gazebo = shutil.which('gz')
+    if gazebo is None:
+        raise RuntimeError('gz: not found in PATH; install Gazebo Harmonic or later')
     return [
         ExecuteProcess(
-            cmd=['gz', 'sim', '-r', *([] if show else ['-s']), str(world)], output='screen'
+            cmd=[gazebo, 'sim', '-r', *([] if show else ['-s']), str(world)],
+            output='screen',
+            on_exit=Shutdown(reason='Gazebo has ended'),
         ),
         Node(
             package='ros_gz_bridge',
@@ -40,6 +49,7 @@ def start_world(context: LaunchContext) -> list:
             name='gazebo_bridge',
             parameters=[{'config_file': str(bridge)}],
             output='screen',
+            on_exit=Shutdown(reason='the bridge has ended'),
         ),
     ]
 

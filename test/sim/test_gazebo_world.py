@@ -215,10 +215,13 @@ def test_its_camera_sees_what_the_driver_assumes(rpy, focal, direction, shift):
     assert math.tan(0.5 * field) == pytest.approx(80.0 / values['fx'], rel=1e-6)
 
 
+TOPIC_TAGS = ('topic', 'odom_topic', 'camera_info_topic')
+
+
 def test_the_bridge_carries_what_the_drivers_use(scenario):
     root = world_of(scenario)
     topics = {item['ros_topic_name']: item for item in yaml.safe_load(bridge_text(scenario))}
-    used = {item.text for tag in ('topic', 'odom_topic') for item in root.iter(tag)}
+    used = {item.text for tag in TOPIC_TAGS for item in root.iter(tag)}
     assert topics.keys() == used | {'/clock'}
     for name, item in topics.items():
         package, _, kind = item['ros_type_name'].split('/')
@@ -259,20 +262,26 @@ def test_measurements_of_another_program(scenario):
             made(SCENARIO | {'robots': {'one': robot}})
 
 
-def test_the_launch_file_starts_simulator_bridge_and_run(tmp_path):
+def test_the_launch_file_starts_simulator_bridge_and_run(tmp_path, monkeypatch):
     """Where the wheels have launch, which is a part of ROS."""
     launch = pytest.importorskip('launch')
     pytest.importorskip('launch_ros')
     path = Path(__file__).parents[2] / 'maasi_sim' / 'launch' / 'gazebo.launch.py'
     made = runpy.run_path(str(path))
     context, world = launch.LaunchContext(), tmp_path / 'arena.sdf'
-    context.launch_configurations |= {'world': str(world), 'gui': 'false'}
+    context.launch_configurations.update({'world': str(world), 'gui': 'false'})
     with pytest.raises(RuntimeError, match=r'arena\.sdf is missing; run_scenario FILE --write'):
         made['start_world'](context)
     assert main(['mambo_turtlebot', '--write-world', str(world)]) == 0
+    program = tmp_path / 'bin' / 'gz'
+    monkeypatch.setenv('PATH', str(program.parent))
+    with pytest.raises(RuntimeError, match='gz: not found in PATH; install Gazebo'):
+        made['start_world'](context)
+    program.parent.mkdir()
+    program.touch(0o755)
     simulator, bridge = made['start_world'](context)
     words = [''.join(part.text for part in word) for word in simulator.cmd]
-    assert words == ['gz', 'sim', '-r', '-s', str(world)]
+    assert words == [str(program), 'sim', '-r', '-s', str(world)]
     assert bridge.node_package == 'ros_gz_bridge'
     entities = made['generate_launch_description']().entities
     assert [item.name for item in entities[:2]] == ['world', 'gui']

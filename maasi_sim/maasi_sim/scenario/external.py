@@ -9,6 +9,7 @@ _GAZEBO = {
     'nav_msgs/msg/Odometry': 'gz.msgs.Odometry',
     'geometry_msgs/msg/TwistStamped': 'gz.msgs.Twist',
     'sensor_msgs/msg/Image': 'gz.msgs.Image',
+    'sensor_msgs/msg/CameraInfo': 'gz.msgs.CameraInfo',
     'sensor_msgs/msg/LaserScan': 'gz.msgs.LaserScan',
 }
 
@@ -53,5 +54,9 @@ def external_topics(name: str, robot: RobotSettings) -> list[ExternalTopic]:
             topic, kind = f'/{name}/camera/detections', 'vision_msgs/msg/Detection2DArray'
             topics.append(ExternalTopic(topic, kind, _ANY))
         else:
-            topics.append(ExternalTopic(f'/{name}/camera/image_raw', 'sensor_msgs/msg/Image', _ANY))
+            info = f'{_ANY}; without it: the calibration of the scenario'
+            topics += [
+                ExternalTopic(f'/{name}/camera/image_raw', 'sensor_msgs/msg/Image', _ANY),
+                ExternalTopic(f'/{name}/camera/camera_info', 'sensor_msgs/msg/CameraInfo', info),
+            ]
     return topics
