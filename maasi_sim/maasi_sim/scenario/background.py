@@ -1,4 +1,7 @@
-"""The background picture of a map: a GeoTIFF, or an image with a world file or an extent."""
+"""The background picture of a map: a GeoTIFF, or an image with a world file or an extent.
+
+Without a picture, terrain is drawn with hill shading.
+"""
 
 import base64
 import warnings
@@ -13,6 +16,8 @@ import numpy as np
 from maasi_filter.arrays import FloatArray
 from maasi_filter.geometry.environment import EnvironmentSettings
 from maasi_filter.geometry.geodesy import geodetic
+from maasi_filter.geometry.terrain_file import read_terrain
+from maasi_sim.scenario.hill_shading import hill_shading
 
 # Longest side of the shown picture [px], its quality, and the margin around the bounds.
 _SIZE, _QUALITY, _MARGIN = 1100, 70, 0.06
@@ -41,14 +46,16 @@ class _Picture(NamedTuple):
 
 @lru_cache(maxsize=4)
 def read_background(environment_json: str) -> Background | None:
-    """Return the picture of an environment, given as JSON; None without one.
+    """Return the picture of an environment, given as JSON, or that of its terrain, or None.
 
     Raises ValueError if it is unreadable or outside of the environment.
     """
     environment = EnvironmentSettings.model_validate_json(environment_json)
     given = environment.background
-    if given.file is None:
+    if given.file is None and environment.terrain.file is None:
         return None
+    if given.file is None:
+        return _over(environment.array(), _of_terrain(environment))
     key = f'environment.background: {given.file}'
     try:
         geotiff = Path(given.file).suffix.lower() in ('.tif', '.tiff') and not given.extent
@@ -60,7 +67,7 @@ def read_background(environment_json: str) -> Background | None:
 
 def background_of(environment: EnvironmentSettings) -> Background | None:
     """Return the picture of an environment, as `read_background`."""
-    if environment.background.file is None:
+    if environment.background.file is None and environment.terrain.file is None:
         return None
     return read_background(environment.model_dump_json(exclude_none=True))
 
@@ -73,10 +80,22 @@ def background_problems(environment: EnvironmentSettings) -> Iterator[str]:
         yield str(error)
 
 
-def _over(bounds: FloatArray, picture: _Picture) -> Background:
+def _of_terrain(environment: EnvironmentSettings) -> _Picture:
+    low, high = _shown(environment.array())
+    pixels = hill_shading(read_terrain(environment)[0], low, high)
+    size = (high - low) / (pixels.shape[1], -pixels.shape[0])
+    return _Picture(pixels, lambda positions: (positions - (low[0], high[1])) / size)
+
+
+def _shown(bounds: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the shown bounds on x and y, with a margin [m]."""
     low, high = bounds[:2].T
     margin = _MARGIN * float((high - low).max())
-    low, high = low - margin, high + margin
+    return low - margin, high + margin
+
+
+def _over(bounds: FloatArray, picture: _Picture) -> Background:
+    low, high = _shown(bounds)
     scale = _SIZE / float((high - low).max())
     width, height = np.maximum(np.rint(scale * (high - low)), 2).astype(int).tolist()
     x = low[0] + (np.linspace(0.0, 1.0, _LATTICE)) * (high[0] - low[0])
