@@ -39,6 +39,7 @@ RANGING = PATIENT | {
     'sensor': {'detection': {'kind': 'box', 'lower': [-4, -4, -6], 'upper': [4, 4, 6]}},
 }
 FLYING = DRIVER | {'start': [1.0, 1.0, 1.0], 'motion': {'model': 'mambo', 'tilt': 0.1}}
+SEEING = FLYING | {'motion': {'model': 'constant_speed', 'speed': 2.0}}
 ROBOT = {
     'candidates': {'grid': [3, 3], 'spacing': 0.5, 'corner': [0.5, 0.5]},
     'motion': {'model': 'unicycle', 'speed': 0.2},
@@ -123,6 +124,7 @@ KINDS = {
     ),
     'turtlebot': Kind(drivers.TurtlebotDriver, driver(DRIVER), '/rover'),
     'mambo': Kind(drivers.MamboDriver, driver(FLYING), '/rover'),
+    'camera': Kind(drivers.CameraDriver, driver(SEEING), '/rover'),
     'ranging': Kind(drivers.RangingDriver, driver(RANGING), '/rover'),
     'mavlink': Kind(drivers.MavlinkDriver, driver(RANGING), '/rover'),
     'mavlink_camera': Kind(drivers.MavlinkCameraDriver, driver(FLYING), '/rover'),
