@@ -11,13 +11,11 @@ from std_msgs.msg import Header
 from maasi_filter.arrays import FloatArray
 from maasi_filter.ros.clocks import Silence, StampGate
 from maasi_filter.ros.conversions import stamp_from_ros, stamp_of_step, stamp_to_ros
-from maasi_filter.ros.keep_outs import KeepOutTopic
 from maasi_filter.ros.lifecycle_node import LockstepLifecycleNode
 from maasi_filter.ros.qos import RELIABLE
 from maasi_filter.ros.run_node import run
 from maasi_msgs.action import SearchTargets
 from maasi_msgs.msg import AgentState, LockstepDone, LockstepStep, PlanDecision
-from maasi_msgs.srv import SetKeepOuts
 from maasi_planner import warm_up
 from maasi_planner.conversions import checked_state, decision_to_ros, path_to_ros
 from maasi_planner.coordinator import Coordinator
@@ -25,6 +23,7 @@ from maasi_planner.homing import CUT_OFF
 from maasi_planner.node.batches import Batches
 from maasi_planner.node.battery_log import BatteryLog
 from maasi_planner.node.filter_guard import FilterGuard, FoundKeeper
+from maasi_planner.node.keep_out_service import KeepOutService
 from maasi_planner.node.orders import Orders
 from maasi_planner.node.other_planners import OtherPlanners
 from maasi_planner.node.reports import Reports
@@ -150,14 +149,7 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
         self.goals = self.orders.set_up(names, self._try_done)
         self._action = SearchAction(self, lambda: self._command('start', None), self._stand)
         offer_services(self, names, self._command)
-        self._keep_outs = KeepOutTopic(
-            self, lambda area: self.coordinator.adopt_area(area), keep=True
-        )
-        service = self.permanent(
-            'search/keep_outs',
-            lambda: self.create_service(SetKeepOuts, 'search/keep_outs', lambda _, answer: answer),
-        )
-        service.callback = self._set_keep_outs
+        KeepOutService(self, lambda area: self.coordinator.adopt_area(area))
         self.create_wall_timer(_CHECK_PERIOD, self._check_team)
 
     def start(self) -> None:
@@ -238,19 +230,6 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
             answer += f'; {text}, which continues'
         self.get_logger().info(answer)
         return True, answer
-
-    def _set_keep_outs(
-        self, request: SetKeepOuts.Request, response: SetKeepOuts.Response
-    ) -> SetKeepOuts.Response:
-        try:
-            if not self.active:
-                raise ValueError('the planner is not active')
-            self._keep_outs.change(request.zones)
-            response.message = f'active keep-outs: {len(request.zones)}'
-            response.success = True
-        except ValueError as error:
-            response.message = str(error)
-        return response
 
     def status(self) -> dict[str, Any]:
         """Return the state of the search."""

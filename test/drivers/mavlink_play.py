@@ -4,8 +4,9 @@ import numpy as np
 
 from maasi_drivers.agent.flight_rules import UNTIL_ARM
 from maasi_drivers.links.mavlink.link import make_sender
+from maasi_drivers.links.mavlink.phases import VehiclePhase
 from maasi_drivers.links.mavlink.protocol import mavlink
-from maasi_drivers.links.mavlink.vehicle import Vehicle, VehiclePhase
+from maasi_drivers.links.mavlink.vehicle import Vehicle
 from maasi_drivers.settings.vehicles import MavlinkSettings
 from maasi_sim.simulation.emulators.mavlink.autopilot_settings import AutopilotSettings
 from maasi_sim.simulation.emulators.mavlink.fake_autopilot import FakeAutopilot

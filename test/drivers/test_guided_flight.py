@@ -9,7 +9,7 @@ import shapely
 from guided_play import GuidedPlay
 
 from maasi_drivers.agent.waypoint_follower import GoalStatus
-from maasi_drivers.links.mavlink.vehicle import VehiclePhase
+from maasi_drivers.links.mavlink.phases import VehiclePhase
 from maasi_filter.geometry.geodesy import geodetic
 from maasi_sim.scenario.loading import load_scenario
 

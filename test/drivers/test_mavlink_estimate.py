@@ -15,8 +15,8 @@ from maasi_drivers.links.mavlink.estimate import (
     swap_orientation,
     swap_yaw,
 )
+from maasi_drivers.links.mavlink.phases import VehiclePhase
 from maasi_drivers.links.mavlink.protocol import ReportLog
-from maasi_drivers.links.mavlink.vehicle import VehiclePhase
 from maasi_drivers.settings.vehicles import MavlinkSettings
 from maasi_filter.models.pose import Pose
 
@@ -62,7 +62,7 @@ def test_a_barometer_that_drifts_before_arming_does_not_keep_it_at_its_take_off(
 def test_the_loss_of_position_or_its_status_is_seen_in_flight(second_gnss, lost, muted, text):
     play = Play(autopilot={'second_gnss': second_gnss}).fly().go()
     if lost:
-        play.autopilot.gnss_lost_at = play.autopilot.now
+        play.autopilot.gnss.lost_at = play.autopilot.now
     if second_gnss:
         # One of two receivers is enough.
         play.run(12.0)

@@ -6,7 +6,7 @@ from mavlink_play import ARM, HEIGHTS, Play, mavlink
 from numpy.testing import assert_allclose
 
 from maasi_drivers.links.mavlink.fence import fence_items
-from maasi_drivers.links.mavlink.vehicle import VehiclePhase
+from maasi_drivers.links.mavlink.phases import VehiclePhase
 from maasi_filter.geometry.area import Area
 from maasi_filter.geometry.environment import EnvironmentSettings
 from maasi_filter.geometry.geodesy import OriginSettings, to_map

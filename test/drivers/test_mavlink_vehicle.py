@@ -10,7 +10,7 @@ from numpy.testing import assert_allclose
 
 from maasi_drivers.links.mavlink.firmware import identify
 from maasi_drivers.links.mavlink.link import make_sender
-from maasi_drivers.links.mavlink.vehicle import VehiclePhase
+from maasi_drivers.links.mavlink.phases import VehiclePhase
 from maasi_filter.models.pose import Pose
 
 # What counts as stopped [m/s].

@@ -1,7 +1,6 @@
 """Phases of a vehicle's flight from its first heartbeat to the end. Without I/O and threads."""
 
 import math
-from enum import Enum
 from pathlib import Path
 from typing import Any
 
@@ -11,38 +10,12 @@ from numpy.typing import ArrayLike
 from maasi_drivers.agent.flight_rules import UNTIL_ARM, ArmPermission
 from maasi_drivers.links.mavlink.autopilot import Autopilot
 from maasi_drivers.links.mavlink.firmware import FailsafeCheck, Firmware
+from maasi_drivers.links.mavlink.phases import COMMANDED, UNABLE, VehiclePhase
 from maasi_drivers.links.mavlink.protocol import ERROR, INFO, WARNING, mavlink
 from maasi_drivers.links.mavlink.setpoints import braking_lead
 from maasi_drivers.settings.vehicles import Ending, MavlinkSettings
 from maasi_filter.arrays import FloatArray
 from maasi_filter.wording import number
-
-
-class VehiclePhase(Enum):
-    """Phase of a vehicle; the value is the reason why it does not continue."""
-
-    CONNECTING = 'no heartbeat yet'
-    PREPARING = 'no position estimate yet'
-    WAITING = 'not armed'
-    STARTING = 'changing mode'
-    ARMING = 'arming'
-    RISING = 'climbing'
-    FLYING = ''
-    RELEASED = 'the pilot has taken over'
-    ENDING = 'ends'
-    STOPPED = 'disarmed'
-    REFUSED = 'released'
-
-
-#: Phases in which the driver commands the vehicle.
-COMMANDED = (
-    VehiclePhase.STARTING,
-    VehiclePhase.ARMING,
-    VehiclePhase.RISING,
-    VehiclePhase.FLYING,
-    VehiclePhase.ENDING,
-)
-
 
 _MODE, _TAKE_OFF = mavlink.MAV_CMD_DO_SET_MODE, mavlink.MAV_CMD_NAV_TAKEOFF
 _SPEED, _GROUND_SPEED = mavlink.MAV_CMD_DO_CHANGE_SPEED, mavlink.SPEED_TYPE_GROUNDSPEED
@@ -55,13 +28,6 @@ _ARMING_PERIOD = 2.0  # period of arming attempts; the autopilot reports refusal
 _STREAM_AHEAD = 1.2  # duration of set-points before a mode that needs them [s]
 # Height tolerance, and smallest change that counts as progress [m].
 _REACHED, _PROGRESS = 0.2, 0.1
-# Phases in which the service `arm` is refused with the fault.
-_UNABLE = (
-    VehiclePhase.CONNECTING,
-    VehiclePhase.RELEASED,
-    VehiclePhase.ENDING,
-    VehiclePhase.REFUSED,
-)
 
 
 class Vehicle(Autopilot):
@@ -203,7 +169,7 @@ class Vehicle(Autopilot):
             return 'it is in the air already'
         if self._displaced:
             return 'the autopilot has restarted: restart the driver'
-        if self.lost or self.flight_origin.problem or self.phase in _UNABLE:
+        if self.lost or self.flight_origin.problem or self.phase in UNABLE:
             return self.fault
         if self.armed and self.firmware is not None and not self.in_external_mode:
             return f'it is flying in {self.firmware.mode_name(self.mode)}'

@@ -35,6 +35,7 @@ from maasi_sim.simulation.emulators.mavlink.autopilot_settings import (
     AutopilotSettings,
 )
 from maasi_sim.simulation.emulators.mavlink.fake_fence import ACTIONS, FakeFence
+from maasi_sim.simulation.emulators.mavlink.fake_gnss import FakeGnss
 from maasi_sim.simulation.emulators.mavlink.flight_model import FlightModel
 from maasi_sim.simulation.emulators.mavlink.guided_flight import GuidedFlight, ReturnFlight
 
@@ -45,18 +46,14 @@ _LANDING, _SURFACING = 0.5, 0.3
 _POSITION_IGNORED, _VELOCITY_IGNORED, _YAW_IGNORED = 0b111, 0b111 << 3, 1 << 10
 _ONLY_POSITION, _ONLY_VELOCITY = 0xDF8, 0xDC7  # masks of POSITION_TARGET_LOCAL_NED
 _FENCE_PERIOD = 0.1  # between two looks at the fence [s]
-_EKF_GOOD, _EKF_START = 1 | 2 | 4 | 8 | 16 | 32, 1 | 128  # of EKF_STATUS_REPORT
-# From the loss of GNSS to that of the position estimate [s].
-_DEAD_RECKONING = 8.0
 _ACCEPTED, _FAILED = mavlink.MAV_RESULT_ACCEPTED, mavlink.MAV_RESULT_FAILED
 
 
 class FakeAutopilot:
     """One vehicle with its autopilot, without a connection and a clock.
 
-    A setpoint that is not finite crashes it, as it did ArduPilot. For tests: when the first
-    receiver loses its fix, messages that do not come, position and velocity sent instead of the
-    true ones.
+    A setpoint that is not finite crashes it, as it did ArduPilot. For tests: messages that do not
+    come, position and velocity sent instead of the true ones.
     """
 
     def __init__(
@@ -84,7 +81,7 @@ class FakeAutopilot:
         self.charge = settings.charge
         self.set_mode('MANUAL' if self.firmware is PX4_COPTER else 'STABILIZE')
         self._first_mode = self.mode
-        self.gnss_lost_at = math.inf
+        self.gnss = FakeGnss(sender, settings.second_gnss)
         self.muted: set[str] = set()
         self.frozen: tuple[float, ...] | None = None
         # Error of the estimated height, and true place of the EKF's origin [m].
@@ -305,23 +302,13 @@ class FakeAutopilot:
         self._sender.extended_sys_state_send(mavlink.MAV_VTOL_STATE_UNDEFINED, state)
 
     def _send_estimator(self) -> None:
-        lost = self.now - self.gnss_lost_at >= _DEAD_RECKONING and not self.settings.second_gnss
-        flags = _EKF_GOOD if self.ready and not lost else _EKF_START
-        self._sender.ekf_status_report_send(flags, 0.1, 0.1, 0.1, 0.1, 0.0)
+        self.gnss.send_estimator(self.now, self.ready)
 
     def _send_gnss(self) -> None:
-        has_fix = self.now < self.gnss_lost_at
-        fix = mavlink.GPS_FIX_TYPE_3D_FIX if has_fix else mavlink.GPS_FIX_TYPE_NO_FIX
-        self._sender.gps_raw_int_send(
-            self._milliseconds * 1000, fix, 0, 0, 0, 100, 100, 0, 0xFFFF, 12
-        )
+        self.gnss.send_first(self.now)
 
     def _send_second_gnss(self) -> None:
-        if self.settings.second_gnss:
-            fix = mavlink.GPS_FIX_TYPE_3D_FIX
-            self._sender.gps2_raw_send(
-                self._milliseconds * 1000, fix, 0, 0, 0, 100, 100, 0, 0xFFFF, 12, 0, 0
-            )
+        self.gnss.send_second(self.now)
 
     def handle(self, message: Any) -> None:
         """Take a message."""
