@@ -25,10 +25,10 @@ def brightness(pixels):
 def test_a_plane_has_the_shade_of_its_side(seed):
     generator = np.random.default_rng(seed)
     along = generator.uniform(0.0, 2.0 * np.pi)
-    x, y = np.meshgrid(np.linspace(0.0, 300.0, 31), np.linspace(0.0, 200.0, 21), indexing='ij')
+    x, y = np.meshgrid(np.linspace(-10, 310, 33), np.linspace(-10, 210, 23), indexing='ij')
     # It descends towards `along`; its slope is drawn as it is.
     ground = -0.8 * (x * np.cos(along) + y * np.sin(along))
-    shown = hill_shading(Terrain(ground, [0.0, 0.0], [10.0, 10.0]), LOW, HIGH)
+    shown = hill_shading(Terrain(ground, [-10.0, -10.0], [10.0, 10.0]), LOW, HIGH)
     assert shown.shape == (367, 550, 4)
     assert np.ptp(shown.astype(int), axis=(0, 1)).max() <= 1
     towards_light = np.cos(along - 0.75 * np.pi)
@@ -40,8 +40,9 @@ def test_a_plane_has_the_shade_of_its_side(seed):
 def test_level_ground_is_transparent_and_gentle_hills_are_visible():
     level = hill_shading(Terrain(np.full((4, 4), 7.0), LOW, [100.0, 100.0]), LOW, HIGH)
     assert not level.any()
-    x = np.linspace(0.0, 300.0, 61)
-    ridge = Terrain(np.outer(0.05 * np.minimum(x, 300.0 - x), np.ones(3)), LOW, [5.0, 100.0])
+    x = np.linspace(-10.0, 310.0, 65)
+    heights = np.outer(0.05 * np.minimum(x, 300.0 - x), np.ones(5))
+    ridge = Terrain(heights, LOW - [10.0, 100.0], [5.0, 100.0])
     shades = brightness(hill_shading(ridge, LOW, HIGH))
     assert shades[:, :270].min() > 15.0
     assert shades[:, 280:].max() < -15.0

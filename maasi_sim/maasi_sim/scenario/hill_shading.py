@@ -10,6 +10,7 @@ from maasi_filter.geometry.terrain import Terrain
 _PIXELS = 550  # on the longer side
 # Light from this height; slope to which gentler ones are exaggerated, at most by a factor.
 _ALTITUDE, _STEEP, _EXAGGERATED = math.radians(45.0), 0.7, 5.0
+_CORNERS = np.array([[-1.0, -1.0], [1.0, -1.0], [-1.0, 1.0], [1.0, 1.0]])
 _STRONGEST = 150.0  # opacity of the darkest shade, up to 255
 
 
@@ -25,7 +26,9 @@ def hill_shading(terrain: Terrain, low: FloatArray, high: FloatArray) -> np.ndar
         for begin, end, number in zip(low, high, size.tolist())
     )
     points = np.stack(np.meshgrid(x, y[::-1]), axis=-1).reshape(-1, 2)
-    slopes = terrain.slopes(points)
+    # Averaged over a cell: slopes of bilinear ground change abruptly between cells.
+    half = 0.5 * terrain.surface.step
+    slopes = np.mean([terrain.slopes(points + half * side) for side in _CORNERS], axis=0)
     steep = float(np.percentile(np.hypot(*slopes.T), 98.0))
     slopes *= min(max(_STEEP / max(steep, 1e-9), 1.0), _EXAGGERATED)
     # Normal (-slope, 1) times the direction of the light, relative to that of level ground.
