@@ -37,6 +37,13 @@ LOOKALIKE = 0.1
 #: Probability of a target's existence below which a rejected one is withdrawn.
 WITHDRAWN = 0.5
 MOST_WEIGHT = 1000.0  # expected targets of one sighting
+#: Least and largest weight by kind; 0 itself is not allowed.
+LIMITS = {
+    CONFIRMED: (0.5, MOST_RELIABLE),
+    REJECTED: (0.5, MOST_RELIABLE),
+    SIGHTING: (0.0, MOST_WEIGHT),
+    SEARCHED: (0.0, 1.0),
+}
 MOST_REPORTS = 1000  # in one search
 MOST_SOURCE = 100  # characters
 CORNERS = 2000  # of a searched zone
@@ -91,8 +98,14 @@ class Report:
         """Horizontal outline of the searched zone."""
         return level_shape(Zone.model_validate(self.zone))
 
-    def check_zone(self) -> None:
-        """Raise ValueError if the zone is needed and no polygon; texts come from messages."""
+    def check(self) -> None:
+        """Raise ValueError if it cannot be used, as numbers and texts come from messages."""
+        least, most = LIMITS[self.kind]
+        if not (least <= self.weight <= most and self.weight > 0.0):
+            above = f'numbers from {least:g}' if least else 'numbers above 0,'
+            raise ValueError(f'weight: read {self.weight:g}, allowed are {above} to {most:g}')
+        if self.kind == SIGHTING and not self.radius > 0.0:
+            raise ValueError(f'radius: read {self.radius:g}, allowed are numbers above 0')
         if self.kind != SEARCHED:
             return
         try:
@@ -196,17 +209,15 @@ def sighting(
     most = 10.0 * float(np.hypot(*size))
     if not 0.0 < radius <= most:
         raise ValueError(f'radius: read {radius:g}, allowed are numbers above 0, to {most:.4g} m')
-    if not 0.0 < weight <= MOST_WEIGHT:
-        raise ValueError(
-            f'weight: read {weight:g}, allowed are numbers above 0, to {MOST_WEIGHT:g}'
-        )
     x, y = map(float, position[:2])
+    report = Report(SIGHTING, weight, _source(source), position=[x, y], radius=radius)
+    report.check()
     if not area.inside(np.array([[x, y]]), bounded=False)[0] or area.outside_by([x, y]) > 0.0:
         gap = area.outside_by([x, y])
         where = f'{how_far(gap)} outside of the area' if gap > 0.0 else 'in a keep-out zone'
         hint = area.exchanged([x, y], gap)
         raise ValueError(f'position: read ({x:g}, {y:g}), which is {where}{hint}')
-    return Report(SIGHTING, weight, _source(source), position=[x, y], radius=radius)
+    return report
 
 
 def searched(

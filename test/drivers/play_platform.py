@@ -53,6 +53,14 @@ class Drone(Node):
     """What both have: a pose, and the position that it flies to."""
 
     frame = topic = ''
+    refused_landings = 0  # so many landings have no effect
+
+    def refuses_landing(self):
+        if self.refused_landings == 0:
+            return False
+        self.refused_landings -= 1
+        say('landing refused')
+        return True
 
     def __init__(self):
         super().__init__('platform', namespace=f'/{NAME}')
@@ -142,7 +150,7 @@ class Crazyflie(Drone):
         return response
 
     def land(self, request, response):
-        if self.state != 'landing':
+        if self.state != 'landing' and not self.refuses_landing():
             goal = [*self.position[:2], request.height]
             self.plan(goal, request.duration, 'landing', moving=False)
         return response
@@ -182,7 +190,7 @@ class Aerostack(Drone):
                 kind,
                 f'{name}Behavior',
                 lambda handle, name=name, start=start: self.run(name, start, handle),
-                goal_callback=lambda _, state=state: self.accept(state),
+                goal_callback=lambda _, name=name, state=state: self.accept(name, state),
                 cancel_callback=lambda _: CancelResponse.ACCEPT,
             )
             for name, (kind, start, state) in kinds.items()
@@ -209,8 +217,9 @@ class Aerostack(Drone):
         say('offboard')
         return response
 
-    def accept(self, state):
+    def accept(self, name, state):
         good = self.state == state and self.armed and self.offboard
+        good = good and not (name == 'Land' and self.refuses_landing())
         return GoalResponse.ACCEPT if good else GoalResponse.REJECT
 
     def move(self):
@@ -276,6 +285,7 @@ class Aerostack(Drone):
 def main():
     rclpy.init()
     node = {'crazyswarm2': Crazyflie, 'aerostack2': Aerostack}[sys.argv[1]]()
+    node.refused_landings = int(sys.argv[2])
     executor = MultiThreadedExecutor(8)
     executor.add_node(node)
     say('ready')

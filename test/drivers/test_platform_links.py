@@ -90,10 +90,16 @@ class Flight:
         return self.path[-1]
 
 
+@pytest.fixture
+def refused_landings():
+    return 0
+
+
 @pytest.fixture(params=PACKAGES)
-def flight(request, context, process, make_team):
+def flight(request, context, process, make_team, refused_landings):
     environment = with_interfaces(PACKAGES[request.param], request.config.cache)
-    with played(environment, 'play_platform.py', request.param) as made:
+    words = 'play_platform.py', request.param, str(refused_landings)
+    with played(environment, *words) as made:
         settings = FLYING | {'link': request.param}
         team = make_team(settings, deaf=True)
         team.used = [team.batches, team.ranges]
@@ -167,6 +173,16 @@ def test_a_stop_ends_a_take_off(flight):
     flight.until_said('take-off stopped')
     assert team.call('release').success
     flight.up()
+
+
+@pytest.mark.parametrize('refused_landings', [1])
+def test_a_landing_that_is_lost_or_refused_is_ordered_again(flight):
+    team = flight.team
+    team.until(lambda: team.call('arm').success)
+    team.until(lambda: flight.path[-1][2] > 0.2)
+    assert team.call('stop').success
+    flight.await_landing()
+    assert flight.read('landing refused')
 
 
 @pytest.mark.parametrize('system', PACKAGES)

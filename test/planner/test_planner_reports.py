@@ -161,12 +161,16 @@ def test_running_freely_reports_are_used_once_and_wrong_ones_are_dropped():
         assert once.min() == 0.5
         # A restarted filter repeats it; then come others.
         publisher.publish(report_of(1))
-        for wrong in ({'kind': 9}, {'weight': float('nan')}, {'zone': 'here'}, {'zone': ''}):
+        sighting = {'kind': ReportMessage.SIGHTING, 'radius': 0.2}
+        bad = [{'kind': 9}, {'zone': 'here'}, {'zone': ''}, {**sighting, 'radius': 0.0}]
+        bad += [{'weight': weight} for weight in (float('nan'), 5.0, 0.0, -0.5)]
+        bad += [{**sighting, 'weight': weight} for weight in (0.0, -1.0, 1e9)]
+        for wrong in bad:
             publisher.publish(report_of(2, **wrong))
         message = report_of(6)
         message.header.frame_id = 'odom'
         publisher.publish(message)
-        team.until(lambda: team.tested.dropped['bad report'] == 5)
+        team.until(lambda: team.tested.dropped['bad report'] == len(bad) + 1)
         np.testing.assert_array_equal(e.values, once)
         # A search that begins again after its end, too.
         planner = team.tested.coordinator

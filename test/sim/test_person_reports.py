@@ -53,6 +53,9 @@ def test_a_report_is_one_fact_even_if_a_restarted_filter_repeats_it(facts):
         ({'zone': 'here'}, 'zone: allowed are well-known text'),
         ({'zone': ''}, 'zone: allowed are well-known text'),
         ({'weight': float('nan')}, 'weight, radius: read nan'),
+        ({'weight': 2.0}, 'weight: read 2, allowed are numbers above 0, to 1'),
+        ({'weight': 0.3, 'kind': Report.REJECTED}, 'weight: read 0.3, allowed are numbers from'),
+        ({'kind': Report.SIGHTING}, 'radius: read 0, allowed are numbers above 0'),
     ],
 )
 def test_unusable_reports_are_dropped_by_name(facts, fields, text):
@@ -68,7 +71,8 @@ def test_reports_are_events_of_the_page_and_of_the_report(facts):
     events = []
     maker = EventMaker({'name': 'x', 'robots': {}, 'bounds': [[0, 100], [0, 100]]}, events.append)
     log = RunLog(load_scenario(find_scenario('mambo')), 1)
-    sighting = report_of(2, 3, kind=Report.SIGHTING, radius=5.0)
+    # The zone of another kind is not read.
+    sighting = report_of(2, 3, kind=Report.SIGHTING, radius=5.0, zone='here')
     sighting.position.x = 7.0
     review = report_of(3, 4, kind=Report.REJECTED, target=6, weight=0.9, source='')
     for message in (zone(1), sighting, review, report_of(0, 5, kind=Report.CLEARED)):

@@ -241,6 +241,10 @@ SIGHTING = {'report': 'add_sighting', 'position': [1, 2.5], 'radius': 3, 'weight
         ({**SIGHTING, 'position': [1]}, 'position: allowed is two numbers'),
         ({**SIGHTING, 'position': [1, 'x']}, 'position: allowed is two numbers'),
         ({**SIGHTING, 'radius': None}, 'radius: allowed is a number'),
+        ({**SIGHTING, 'radius': 10**400}, 'radius: allowed is a number of at most 300 digits'),
+        ({**SIGHTING, 'position': [10**400, 0]}, 'position: allowed is a number of at most'),
+        ({**SIGHTING, 'source': 'A\0nn'}, 'source: allowed is text without control characters'),
+        ({**REVIEW, 'source': '\ud800'}, 'source: allowed is text without control characters'),
         ({'report': 'mark_searched', 'zone': 3}, 'zone: allowed is text'),
     ],
 )

@@ -111,7 +111,7 @@ def free_length(
 ) -> float:
     """Return the length of a straight path, at most `longest` [m], that is clear of all zones."""
     keep_out = motion.keep_out
-    if not len(keep_out):
+    if not len(keep_out) or longest <= 0.0:
         return longest
     # No zone is thinner, as the robot's radius surrounds it.
     step = longest / math.ceil(longest / max(keep_out.radius, 0.1))

@@ -71,9 +71,10 @@ class OdometryTopic:
         bounded('pose.covariance', covariance, FARTHEST**2)
         # The message is valid: from here on it may change what is known of the odometry.
         if changed:
-            driver.get_logger().warning(
+            driver.warn_throttled(
+                'frame of the odometry',
                 f'odom: header.frame_id is {frame!r}, the first messages were {before} '
-                f'{settings.frame!r}: restarting'
+                f'{settings.frame!r}: restarting',
             )
             driver.restart('the frame of the odometry changed')
             driver.map_odometry, self._in_a_row = None, 0

@@ -208,6 +208,11 @@ class PlatformLink(RobotLink):
                 self._land(f'no take-off within {longest:.0f} s', at_once=True)
         elif self.phase is Phase.FLYING and aloft is False and elapsed > _SETTLING:
             self._enter(Phase.GROUND, f'{self.system} has landed it, {UNTIL_ARM}')
+        elif self.phase is Phase.LANDING and elapsed > longest and self.aloft():
+            # Lost, or refused: without another one it would hover until its battery is empty.
+            self._since = time.monotonic()
+            driver.get_logger().error(f'not landed within {longest:.0f} s: landing again')
+            self.land(self._climb)
         elif self.phase is Phase.LANDING and (aloft is False or elapsed > longest):
             self._enter(Phase.GROUND, f'{self._reason}, {UNTIL_ARM}')
         elif self.phase is Phase.FLYING and BATTERY in driver.health:

@@ -196,7 +196,7 @@ def report_from_ros(message: ReportMessage, dimension: int) -> Report:
         1e-9 * stamp_from_ros(message.header.stamp),
         int(message.batch_id),
     )
-    report.check_zone()
+    report.check()
     return report
 
 

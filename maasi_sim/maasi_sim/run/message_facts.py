@@ -243,7 +243,7 @@ class MessageFacts:
                 time,
                 int(message.batch_id),
             )
-            report.check_zone()
+            report.check()
             yield facts.Reported(time, team, report)
 
     def _plan(self, topic: str, message: Any) -> Iterator[facts.Fact]:

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 
 from maasi_filter.arrays import FloatArray
 from maasi_filter.records import FoundTarget
+from maasi_filter.reports import SEARCHED
 from maasi_filter.wording import point
 from maasi_sim.run import facts
 from maasi_sim.run.scores import Scoreboard
@@ -266,7 +267,7 @@ class EventMaker:
         if report is None:
             self._put(fact.time, 'report', fact.team, 'cleared')
             return
-        zones = zones_as('searched', [report.shape]) if report.zone else []
+        zones = zones_as('searched', [report.shape]) if report.kind == SEARCHED else []
         numbers = significant(report.radius), significant(report.weight)
         content = report.target, self._rounded(report.position), *numbers, zones
         self._put(fact.time, 'report', fact.team, report.kind, *content)

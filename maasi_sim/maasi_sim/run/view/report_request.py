@@ -36,12 +36,26 @@ def read_report(body: Mapping[str, Any]) -> ReportRequest:
         # In JSON true and false are no numbers.
         if not isinstance(value, kinds) or (isinstance(value, bool) and bool not in kinds):
             raise ValueError(f'{name}: allowed is {_WORDS[kinds[-1]]}')
-        fields[name] = float(body[name]) if kinds is _NUMBER else value
+        fields[name] = _number(name, value) if kinds is _NUMBER else value
+        if kinds is _TEXT and not _is_text(value):
+            raise ValueError(f'{name}: allowed is text without control characters')
     if not 0 <= fields.get('id', 0) <= _LARGEST_ID:
         raise ValueError('id: allowed is the number of a found target')
     if 'position' in fields:
         at = fields['position']
         if len(at) != 2 or not all(type(value) in _NUMBER for value in at):
             raise ValueError(f'position: allowed is {_WORDS[list]}')
-        fields['position'] = [float(value) for value in at]
+        fields['position'] = [_number('position', value) for value in at]
     return ReportRequest(service, team.strip('/'), fields)
+
+
+def _number(name: str, value: Any) -> float:
+    try:
+        return float(value)
+    except OverflowError:
+        raise ValueError(f'{name}: allowed is a number of at most 300 digits') from None
+
+
+def _is_text(value: Any) -> bool:
+    """Return whether a message can hold a text: neither NUL nor halves of characters."""
+    return '\0' not in value and not any('\ud800' <= sign <= '\udfff' for sign in value)
