@@ -1,6 +1,7 @@
 """What the packages declare is what they import, and what rosdep and pip can install."""
 
 import ast
+import re
 import sys
 from importlib.metadata import version
 from pathlib import Path
@@ -93,3 +94,25 @@ def test_what_is_installed_is_declared() -> None:
     needed = {name for package in PACKAGES for name in requirements(package, False)}
     # These come with pydantic and matplotlib; what is large and for GIS files only is for tests.
     assert installed == needed - OURS - {'typing_extensions', 'Pillow', 'pyogrio', 'rasterio'}
+
+
+def test_the_file_for_pixi_has_what_the_packages_need() -> None:
+    text = (ROOT / 'docs' / 'pixi.toml').read_text()
+    # As `tomllib`, which Python 3.10 lacks: tables of quoted values.
+    tables = {
+        table.split(']')[0]: dict(re.findall(r'^([\w-]+) = "(.*)"$', table, re.MULTILINE))
+        for table in re.split(r'^\[', text, flags=re.MULTILINE)[1:]
+    }
+    needed = {name: item for path in PACKAGES for name, item in requirements(path, False).items()}
+    python = {name: str(item.specifier) for name, item in needed.items() if name not in OURS}
+    conda = tables['dependencies']
+    given = {**tables['pypi-dependencies'], 'numpy': conda['numpy']}
+    # Without what is for GIS files only.
+    assert {name: set(text.split(',')) for name, text in given.items()} == {
+        name: set(text.split(','))
+        for name, text in python.items()
+        if name not in ('pyogrio', 'rasterio')
+    }
+    # `ros-base` brings the other packages of ROS.
+    names = {name.removeprefix('ros-jazzy-').replace('-', '_') for name in conda}
+    assert {'ros_base', 'nav2_msgs', 'vision_msgs', 'rosidl_default_generators'} <= names
