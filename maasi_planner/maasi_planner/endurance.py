@@ -23,6 +23,8 @@ _TIME_WINDOW, _TIME_PRIOR = 60.0, 5.0
 # At a charger: shares of a full battery that count as gained or lost, and the time without a gain
 # after which the robot counts as not charged [s].
 _GAINED, _LOST, CHARGING_PATIENCE = 0.005, 0.02, 180.0
+# The charge of a robot may fall for so long after its arrival, until it rests at the charger [s].
+_SETTLING = 10.0
 # Target charge of a robot that can afford nothing with `full`.
 _TOP = 0.999
 #: Reasons of done robots.
@@ -168,9 +170,9 @@ class Endurance:
         # Charge beyond the last prediction of the path home, less twice the use after it, as the
         # flight back uses as much again. None: no prediction.
         self._slack: float | None = None
-        # Highest charge at the charger, and the time without a rise [s].
+        # Highest charge at the charger, the time without a rise, and the time there [s].
         self._peak = math.nan
-        self._waited, self._target = 0.0, settings.full
+        self._waited, self._stayed, self._target = 0.0, 0.0, settings.full
         #: Whether it has the highest charge that its charger gives.
         self.topped = False
 
@@ -244,13 +246,19 @@ class Endurance:
 
         With an unknown charge, or without use, the range is infinite and the end is the position.
         """
-        settings, speed = self.settings, self.motion.settings.speed
-        use = 1.1 * self.use(1.0 / speed, 1.0)
-        if math.isnan(self.charge) or use <= 0.0:
+        if math.isnan(self.charge) or math.isinf(self.full_range()):
             return math.inf, np.array(position)
         uses = [self._to_charger(row, position) for row in range(len(self.chargers))]
-        left = max(self.charge - settings.reserve - self.leg - self._margin(0.0), 0.0)
-        return left / use, self.chargers[int(np.argmin(uses))]
+        return self._range(self.charge - self.leg), self.chargers[int(np.argmin(uses))]
+
+    def full_range(self) -> float:
+        """Return the longest path [m] after a charge that leaves the reserve."""
+        return self._range(self.settings.full)
+
+    def _range(self, charge: float) -> float:
+        use = self.use(1.0 / self.motion.settings.speed, 1.0)
+        left = max(charge - self.settings.reserve - self._margin(0.0), 0.0)
+        return left / use if use > 0.0 else math.inf
 
     def affords(self, paths: Trajectories, step: float) -> BoolArray:
         """Return which predicted paths leave enough charge to get home with the reserve, (W,)."""
@@ -313,7 +321,8 @@ class Endurance:
     def begin(self, phase: Phase, reason: str = '') -> None:
         """Enter a phase; reason: why the robot is done."""
         self.phase, self.done_reason = phase, reason if phase is Phase.DONE else ''
-        self._peak, self._waited, self._target = math.nan, 0.0, self.settings.full
+        self._peak, self._waited, self._stayed = math.nan, 0.0, 0.0
+        self._target = self.settings.full
         self.topped = False
 
     def top(self) -> None:
@@ -406,10 +415,13 @@ class Endurance:
         if not home:
             self.begin(Phase.RETURNING)
             return
+        self._stayed += seconds
         if not self.charge <= self._peak + _GAINED:
             self._peak, self._waited = self.charge, 0.0
         else:
             self._waited += seconds
+        if self._stayed < _SETTLING:
+            self._peak = min(self._peak, self.charge)
         lost = not self.estimated and self.charge < self._peak - _LOST
         over = lost or self._waited > CHARGING_PATIENCE
         if self.charge >= self._target or (over and self.charge >= self.settings.full):

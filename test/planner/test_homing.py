@@ -254,6 +254,22 @@ def test_a_robot_that_is_not_charged_stays_at_home_and_the_search_goes_on_withou
     assert flight.fly(20.0, lambda: not flight.at_home('b'))
 
 
+@pytest.mark.parametrize('seed', range(20))
+def test_a_robot_whose_charge_falls_until_it_rests_on_its_charger_is_charged(seed):
+    random = np.random.default_rng(seed)
+    flight = Flight({'a': robot([3.0, 3.0])})
+    endurance = flight.coordinator.robots['a'].endurance
+    state, charge, k = flight.bodies['a'].robot_state(), random.uniform(0.1, 0.5), 0
+    endurance.begin(Phase.RETURNING)
+    # A small battery: hovering uses up to 2 % of it a second.
+    settles, use, rate = random.uniform(0.0, 9.0), random.uniform(0.0, 0.02), 0.03
+    while charge < endurance.settings.full:
+        endurance.update(k, state, charge, True)
+        assert endurance.phase is Phase.CHARGING
+        charge += STEP * (rate if k * STEP > settles else -min(use, charge / 10.0))
+        k += 1
+
+
 @pytest.mark.parametrize('planner', ['nearest_widest', 'maasi', 'tour', 'lawnmower'])
 def test_a_robot_that_affords_nothing_with_a_full_battery_is_done_and_says_so_once(planner):
     flight = Flight({'a': robot([3.0, 3.0], reserve=0.97)}, planner)
