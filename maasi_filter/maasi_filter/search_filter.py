@@ -207,12 +207,9 @@ class SearchFilter(ABC):
         self.reports.append(report)
         if report.kind in (CONFIRMED, REJECTED):
             self.review(report.target, self.statements(report.target))
-        elif report.kind == SIGHTING:
-            sightings = (*self.area.sightings, sighting_of(report))
-            self.area = self.area.with_sightings(sightings)
-            self.exploration.adopt_sightings(self.area)
-        elif report.kind == SEARCHED:
-            self.exploration.search(report.shape, report.weight)
+        self.exploration.use(report)
+        self.area = self.exploration.area
+        if report.kind == SEARCHED:
             self.thin(report)
         return report
 

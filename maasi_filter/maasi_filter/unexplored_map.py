@@ -22,6 +22,7 @@ from maasi_filter.models.detection import (
 )
 from maasi_filter.models.line_of_sight import probability_in_sight
 from maasi_filter.models.pose import Pose
+from maasi_filter.reports import SEARCHED, SIGHTING, Report, sighting_of
 
 # Density samples per cell on each axis, and the number on a whole axis above which a cell
 # gets fewer.
@@ -254,6 +255,14 @@ class UnexploredMap:
         inside = shapely.contains_xy(zone, *np.meshgrid(x, y, indexing='ij'))
         share = inside.reshape(-1, number, len(y) // number, number).mean(axis=(1, 3))
         self._values[near[0], near[1]] *= 1.0 - probability * share[:, :, None]
+
+    def use(self, report: Report) -> None:
+        """Use a sighting, or a search by others; reviews change nothing here."""
+        if report.kind == SIGHTING:
+            sightings = (*self.area.sightings, sighting_of(report))
+            self.adopt_sightings(self.area.with_sightings(sightings))
+        elif report.kind == SEARCHED:
+            self.search(report.shape, report.weight)
 
     def _adopt(self, area: Area) -> None:
         self.area, self.volume = area, area.volume

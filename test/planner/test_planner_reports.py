@@ -188,9 +188,13 @@ def test_running_freely_reports_are_used_once_and_wrong_ones_are_dropped():
         team.tested.reset()
         np.testing.assert_array_equal(team.tested.coordinator.exploration.values, once)
         publisher.publish(report_of(0, kind=ReportMessage.CLEARED))
+        team.until(lambda: team.tested.coordinator.exploration.values.min() == 1.0)
+        # A node that is not active receives them, too, as they come only once.
+        assert team.tested.trigger_deactivate().name == 'SUCCESS'
         publisher.publish(report_of(1))
-        e = team.tested.coordinator.exploration
-        team.until(lambda: e.values.min() == 0.25)
+        team.until(lambda: team.tested.coordinator.exploration.values.min() == 0.5)
+        assert team.tested.trigger_activate().name == 'SUCCESS'
+        np.testing.assert_array_equal(team.tested.coordinator.exploration.values, once)
 
 
 def test_in_lockstep_reports_are_used_with_the_update_that_includes_them():

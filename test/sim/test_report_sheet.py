@@ -17,6 +17,7 @@ from maasi_filter.geometry.environment import EnvironmentSettings
 from maasi_filter.geometry.geodesy import geodetic
 from maasi_filter.models.pose import Pose
 from maasi_filter.records import FoundTarget, Label
+from maasi_filter.reports import Report
 from maasi_filter.unexplored_map import UnexploredMap
 from maasi_sim.run import facts
 from maasi_sim.run.log import RunEnd, RunLog
@@ -28,6 +29,7 @@ from maasi_sim.scenario.loading import load_scenario
 from maasi_sim.search import search
 
 ORIGIN = {'latitude': 46.0, 'longitude': 23.5, 'altitude': 350.0}
+PLACES = [20.0, 20.0], [5.0, 55.0]
 BEGAN = datetime(2026, 5, 4, 3, 2, 1, tzinfo=timezone.utc).timestamp()
 
 
@@ -176,6 +178,34 @@ def test_sectors_share_the_probability_of_success(run, tmp_path):
     two = UnexploredMap(Area(EnvironmentSettings.model_validate(values)), 1.0)
     assert [part.name for part in sectors(two)] == ['1', '2']
     assert [part.poa for part in sectors(two)] == pytest.approx([0.25, 0.75], abs=0.01)
+
+
+def test_statements_of_persons_count_in_the_order_of_their_times(tmp_path):
+    """A search of others is a measurement; a sighting leaves what was searched before it."""
+    log = RunLog(scenario_of(tmp_path), 1)
+    log.end_time = 100.0
+    measured(log, (20.0, 20.0))
+    own = explored_after(log)
+    zone = Report('searched', 0.5, zone='45 45 10', position=[45.0, 45.0], time=50.0)
+    near, far = (Report('sighting', 2.0, position=at, radius=4.0, time=60.0) for at in PLACES)
+    # Two filters receive the same one; the last is after the end.
+    late = replace(zone, zone='30 5 5', time=101.0)
+    for team, report in (('', zone), ('a', zone), ('', far), ('', late)):
+        log.add(facts.Reported(report.time, team, report))
+    explored = explored_after(log)
+    expected = own.copy()
+    expected.search(zone.shape, 0.5)
+    before = expected.explored_fraction()
+    assert before > own.explored_fraction() + 0.02
+    expected.use(far)
+    np.testing.assert_array_equal(explored.values, expected.values)
+    # N0 = 2 grows by 2, which nobody has searched; the density has cells of its own.
+    assert explored.area.expected_targets == 4.0
+    assert explored.explored_fraction() == pytest.approx(0.5 * before, rel=2e-3)
+    # A new search of that filter forgets them, but not those of the other one.
+    log.add(facts.Reported(70.0, '', None))
+    log.add(facts.Reported(70.0, '', near))
+    assert [item.kind for item in log.reports()] == ['searched', 'sighting']
 
 
 def test_a_run_writes_the_page(run):

@@ -43,10 +43,12 @@ class Reports:
             self._use_waiting(number)
 
     def _on_report(self, message: ReportMessage) -> None:
-        if not self._node.active:
-            return
+        # Also before the node is active: a latched message arrives only once.
         if message.kind == ReportMessage.CLEARED:
-            self._waiting, self._used = [], []
+            used, self._waiting, self._used = self._used, [], []
+            if used and not self._node.settings.lockstep:
+                # The filter has begun a new search; used statements cannot be taken back.
+                self._node.reset()
         elif message not in self._used and message not in self._waiting:
             # A restarted filter repeats those that it knows.
             self._waiting.append(message)

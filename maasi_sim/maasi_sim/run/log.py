@@ -17,6 +17,7 @@ import numpy as np
 from maasi_filter.arrays import FloatArray
 from maasi_filter.models.pose import Pose
 from maasi_filter.records import FoundTarget
+from maasi_filter.reports import Report
 from maasi_filter.unexplored_map import UnexploredMap
 from maasi_planner.motion import RobotState
 from maasi_planner.team import Decision
@@ -77,6 +78,8 @@ class RunRecord:
         self.began: float | None = None
         # Time and position of the states of each robot; an hour needs 2 MB.
         self._path = {name: array('d') for name in scenario.names()}
+        # Statements of persons by filter.
+        self._reports: dict[str, list[Report]] = defaultdict(list)
         # Time and charge of its battery, after each change.
         self._charges: dict[str, list[tuple[float, float]]] = {
             name: [] for name in scenario.names()
@@ -106,9 +109,12 @@ class RunRecord:
             case facts.Left(time, robot) if robot in self._path:
                 self.team.discard(robot)
                 self._note_lost(time, robot, True)
-            case facts.Reported(time, _, report) if report is not None:
-                source = report.source or 'a person'
-                self._note(time, source, str(report))
+            case facts.Reported(time, team, report):
+                if report is None:
+                    self._reports[team].clear()
+                else:
+                    self._reports[team].append(report)
+                    self._note(time, report.source or 'a person', str(report))
 
     def _note_lost(self, time: float, robot: str, lost: bool, reason: str = '') -> None:
         # A robot that left stays lost, even if its driver still publishes.
@@ -131,6 +137,20 @@ class RunRecord:
     def trajectories(self) -> dict[str, FloatArray]:
         """Odometry positions of each robot: time [s], x, y, z [m], (n, 4)."""
         return {name: np.array(path).reshape(-1, 4) for name, path in self._path.items()}
+
+    def reports(self) -> list[Report]:
+        """Return the statements of persons until the end, in order; what several filters got once.
+
+        Their times are those of the run.
+        """
+        found: dict[tuple[object, ...], Report] = {}
+        for report in (item for reports in self._reports.values() for item in reports):
+            what = report.kind, report.target, report.zone, *report.position, report.radius
+            found.setdefault((*what, report.weight, report.source), report)
+        return sorted(
+            (item for item in found.values() if item.time <= self.end_time),
+            key=lambda item: item.time,
+        )
 
     def charges(self, robot: str) -> list[float]:
         """Return the charges of a robot's battery until the end, 0 to 1; empty: unknown."""

@@ -1,5 +1,7 @@
 """The report of a search for targets, as plain values and text."""
 
+import math
+from collections import deque
 from itertools import takewhile
 from typing import Any
 
@@ -53,7 +55,7 @@ def build_report(log: RunLog) -> dict[str, Any]:
 
 
 def explored_after(log: RunLog) -> UnexploredMap:
-    """Return the map of unexplored area after all measurements."""
+    """Return the map of unexplored area after all measurements and statements of persons."""
     scenario, area = log.scenario, Area(log.scenario.environment)
     sensors = {
         name: robot.sensor.build(name, scenario.dimension)
@@ -61,9 +63,17 @@ def explored_after(log: RunLog) -> UnexploredMap:
     }
     spacing, _ = map_spacing(area.bounds, sensors.values())
     explored = UnexploredMap(area, scenario.filter.exploration_spacing or spacing)
-    for name, poses in log.measured_from.items():
-        for _, pose in poses:
-            explored.update(sensors[name].detection, pose)
+    left = {name: deque(poses) for name, poses in log.measured_from.items()}
+
+    def measure(until: float) -> None:
+        for name, poses in left.items():
+            while poses and poses[0][0] <= until:
+                explored.update(sensors[name].detection, poses.popleft()[1])
+
+    for report in log.reports():
+        measure(report.time)
+        explored.use(report)
+    measure(math.inf)
     return explored
 
 
