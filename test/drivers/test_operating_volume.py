@@ -7,12 +7,14 @@ import pytest
 import shapely
 from numpy.testing import assert_array_equal
 
-from maasi_drivers.agent.flight_rules import flight_volume
+from maasi_drivers.agent.flight_rules import flight_volume, free_length
 from maasi_drivers.links.mavlink.fence import fence_items
 from maasi_drivers.settings.vehicles import FlightSettings
 from maasi_filter.geometry.area import Area
 from maasi_filter.geometry.environment import EnvironmentSettings
 from maasi_filter.geometry.operating_volume import MARGIN
+from maasi_planner.motion import make_motion
+from maasi_planner.settings import MotionSettings
 from maasi_sim.simulation.emulators.mavlink.fake_fence import FakeFence
 
 CLOSE = 0.03  # corners of the autopilot's fence are rounded to 1e-7 degrees [m]
@@ -72,3 +74,19 @@ def test_all_that_ask_where_a_robot_may_be_agree(seed):
         assert gap <= MARGIN or drift or position[2] < volume.limits[2, 0]
         assert volume.distance_outside(nearest) == 0.0
         assert np.abs(nearest - position).max() == gap
+
+
+@pytest.mark.parametrize('seed', range(20))
+def test_the_free_length_of_a_path_ends_before_a_zone(seed):
+    rng = np.random.default_rng(seed)
+    area = random_volume(rng).area
+    motion = make_motion(MotionSettings(model='constant_speed', speed=1.0), area, 0.3)
+    low, high = np.pad(area.bounds, ((0, 3 - area.dimension), (0, 0)), constant_values=1.0).T
+    for longest in (0.0, 1e-9, *rng.uniform(0.0, 5.0, 20)):
+        position = rng.uniform(low, high)
+        direction = rng.normal(size=3)
+        direction /= np.linalg.norm(direction)
+        free = free_length(motion, position, direction, longest)
+        assert 0.0 <= free <= longest + 1e-9
+        if free > 0.0:
+            assert motion.keep_out.is_free(position + free * direction)
