@@ -85,6 +85,8 @@ maasi_make_venv() {
     requirements+=(-c "$maasi_workspace/constraints.txt")
   else
     echo "Setting up: ROS 2 ${maasi_distro^} and Python packages as wheels (downloads about 250 MB) ..." >&2
+    # What another ROS 2 has there would be taken as installed.
+    unset PYTHONPATH
     "$python" -m venv "$maasi_venv"
     requirements+=(-r "$maasi_requirements/requirements-$maasi_distro.txt")
   fi
