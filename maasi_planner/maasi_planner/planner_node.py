@@ -33,7 +33,7 @@ from maasi_planner.node.team_goals import ReceivedState
 from maasi_planner.node.views import PlannerViews
 from maasi_planner.node_settings import PlannerNodeSettings
 from maasi_planner.robot_plan import PresentRobot
-from maasi_planner.terrain_frame import above_ground
+from maasi_planner.terrain_frame import above_ground, decision_on_map
 
 _CHECK_PERIOD = 0.1
 # At shutdown: longest wait for answers to goals, which are then cancelled [s], and executor rounds
@@ -441,9 +441,10 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
     def _announce(self, decision: Any, header: Header) -> None:
         self._decisions += 1
         indices = {name: self.coordinator.robots[name].plan.decision for name in decision.robots}
+        shown = decision_on_map(decision, self.coordinator.area.terrain)
         self._decision_publisher.publish(
             decision_to_ros(
-                decision,
+                shown,
                 indices,
                 self.settings.planner.name,
                 self.batches.used,
@@ -467,7 +468,8 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
                 self.get_logger().info(f'{name} {robot.reason}')
                 self.orders.interrupt_homing(name)
             self.orders.send(name, plan.goal_id, robot.waypoint, header)
-            self._path_publishers[name].publish(path_to_ros(robot.positions, header))
+            path = path_to_ros(shown.robots[name].positions, header)
+            self._path_publishers[name].publish(path)
 
     def _try_done(self) -> None:
         if (

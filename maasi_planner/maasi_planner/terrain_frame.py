@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 from numba import njit
@@ -14,6 +15,7 @@ from maasi_filter.geometry.terrain import Surface, Terrain, clearance_along, hei
 from maasi_filter.models.pose import Pose
 from maasi_planner.motion.base import MotionModel, RobotState
 from maasi_planner.settings import RobotModel
+from maasi_planner.team import Decision
 
 # The ground ahead is sampled this often in a cell, at most so often in all.
 _PER_CELL, _SAMPLES = 4.0, 400
@@ -28,6 +30,32 @@ def above_ground(state: RobotState, terrain: Terrain | None) -> RobotState:
     position[2] -= terrain.height(position)
     velocity[2] -= float(terrain.slopes(position[None])[0] @ velocity[:2])
     return RobotState(Pose(position, state.pose.orientation), velocity, state.angular_velocity)
+
+
+def on_map(positions: FloatArray, terrain: Terrain | None) -> FloatArray:
+    """Return positions (n, 3) whose z are heights above ground in the map [m]."""
+    if terrain is None or not len(positions):
+        return positions
+    raised = np.array(positions, dtype=float)
+    raised[:, 2] += terrain.heights(raised)
+    return raised
+
+
+def decision_on_map(decision: Decision, terrain: Terrain | None) -> Decision:
+    """Return a decision with all positions in the map, as messages and records have them."""
+    if terrain is None:
+        return decision
+    robots = {
+        name: replace(
+            robot,
+            waypoint=on_map(robot.waypoint[None], terrain)[0],
+            positions=on_map(robot.positions, terrain),
+            candidates=on_map(robot.candidates, terrain),
+            tour=on_map(robot.tour, terrain),
+        )
+        for name, robot in decision.robots.items()
+    }
+    return replace(decision, robots=robots)
 
 
 def least_height(robot: RobotModel) -> float:

@@ -24,7 +24,7 @@ from maasi_planner.motion import RobotState, make_motion
 from maasi_planner.planners import Planner
 from maasi_planner.robot_plan import PresentRobot
 from maasi_planner.settings import PlannerSettings
-from maasi_planner.terrain_frame import above_ground
+from maasi_planner.terrain_frame import above_ground, decision_on_map
 from maasi_sim.compiling import compiling_said
 from maasi_sim.run.facts import Decided, Left, Measured, Truth, Updated
 from maasi_sim.scenario.schema import Scenario, planner_settings, steps_of
@@ -170,7 +170,8 @@ class _Search:
             duration = perf_counter() - begin
             indices = {name: robots[name].plan.decision for name in decision.robots}
             explored = coordinator.exploration.explored_fraction()
-            made = Decided(self.time, group.space, decision, indices, explored, duration=duration)
+            shown = decision_on_map(decision, self.world.area.terrain)
+            made = Decided(self.time, group.space, shown, indices, explored, duration=duration)
             self.log.add(made)
             self.log.add_map(self.time, group.space, coordinator.exploration, now=True)
             for name, chosen in decision.robots.items():

@@ -1,13 +1,18 @@
 """Searches over terrain: what a scenario is refused for, and heights of robots and targets."""
 
+import json
 from copy import deepcopy
 
 import numpy as np
 import pytest
 
+from maasi_filter.geometry.area import Area
+from maasi_filter.geometry.geodesy import OriginSettings
+from maasi_sim.run.targets.exports import plan_text
 from maasi_sim.scenario.layering import ScenarioError
 from maasi_sim.scenario.loading import load_scenario, scenario_from_values
 from maasi_sim.scenario.preflight import preflight
+from maasi_sim.search import search
 from maasi_sim.simulation.robots import Simulation
 
 MAVLINK = {'arm': True, 'url': 'udpin:127.0.0.1:14577'}
@@ -75,3 +80,27 @@ def test_the_estimate_describes_the_terrain(tmp_path, seed):
     del values['environment']['terrain']
     flat = preflight(scenario_from_values(values, 'test')).lines
     assert not any('terrain' in line for line in flat)
+
+
+def test_records_and_plans_have_heights_of_the_map():
+    """The planner's heights are above ground, those of a plan file from the start."""
+    values = deepcopy(load_scenario('hills').content())
+    origin = OriginSettings(latitude=46.6, longitude=9.9)
+    values['environment']['origin'] = origin.model_dump()
+    values['limits'] = {'time': 60.0}
+    log = search(scenario_from_values(values, 'test'), 1)
+    terrain = Area(log.scenario.environment).terrain
+    paths = log.planned_paths()
+    for name, height in {'east': 30.0, 'west': 30.0, 'rover': 1.5}.items():
+        path = paths[name]
+        assert len(path) >= 2
+        above = path[:, 2] - terrain.heights(path)
+        # The first one is a measured position.
+        assert above[1:] == pytest.approx(height, abs=1e-6) and abs(above[0] - height) < 0.5
+    for decision in log.decisions:
+        for chosen in decision.robots.values():
+            positions = np.vstack([chosen.waypoint, chosen.positions, chosen.tour])
+            assert (positions[:, 2] > terrain.heights(positions)).all()
+    plan = json.loads(plan_text(paths['west'], [], origin))
+    heights = [item['Altitude'] for item in plan['mission']['items']]
+    assert heights == pytest.approx((paths['west'][1:, 2] - paths['west'][0, 2]).tolist(), abs=0.1)

@@ -16,6 +16,7 @@ from maasi_planner.conversions import area_markers, exploration_to_ros, planner_
 from maasi_planner.coordinator import Coordinator
 from maasi_planner.node_settings import PlannerNodeSettings
 from maasi_planner.robot_plan import PresentRobot
+from maasi_planner.terrain_frame import on_map
 
 
 class PlannerViews:
@@ -55,12 +56,13 @@ class PlannerViews:
             # Viewers omit NaN.
             unseen[unseen < 0.0] = np.nan
             self._exploration.publish(particles_to_ros(exploration.nodes(), unseen, header))
-        shown = {}
+        shown, terrain = {}, coordinator.area.terrain
         for name, robot in robots.items():
             plan = coordinator.robots[name].plan
             here = np.asarray(robot.state.pose.position)
             waypoint = plan.positions[-1] if len(plan.positions) else here
-            shown[name] = (here, waypoint, plan.positions, plan.tour)
+            ends = on_map(np.stack([here, waypoint]), terrain)
+            shown[name] = (*ends, on_map(plan.positions, terrain), on_map(plan.tour, terrain))
         # Colours are those of the whole team, also for a robot with its own planner.
         tints = robot_colours([*coordinator.names, *self._node.settings.others])
         markers = planner_markers(shown, tints, header, self._size)
