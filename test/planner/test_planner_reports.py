@@ -8,7 +8,7 @@ from test_planner_node import running, update_of
 
 from maasi_filter.geometry.area import Area
 from maasi_filter.geometry.environment import EnvironmentSettings
-from maasi_filter.reports import Report
+from maasi_filter.reports import MOST_REPORTS, Report
 from maasi_filter.ros.qos import LATCHED_ALL
 from maasi_msgs.msg import Report as ReportMessage
 from maasi_planner.coordinator import Coordinator
@@ -195,6 +195,15 @@ def test_running_freely_reports_are_used_once_and_wrong_ones_are_dropped():
         team.until(lambda: team.tested.coordinator.exploration.values.min() == 0.5)
         assert team.tested.trigger_activate().name == 'SUCCESS'
         np.testing.assert_array_equal(team.tested.coordinator.exploration.values, once)
+
+
+def test_no_more_statements_are_stored_than_a_filter_accepts():
+    with running() as team:
+        reports = team.tested.reports
+        for number in range(1, MOST_REPORTS + 4):
+            reports._on_report(report_of(number, kind=ReportMessage.CONFIRMED, weight=0.9))
+        assert len(reports._used) == MOST_REPORTS
+        assert team.tested.dropped['bad report'] == 3
 
 
 def test_in_lockstep_reports_are_used_with_the_update_that_includes_them():

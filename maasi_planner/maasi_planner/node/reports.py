@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 
-from maasi_filter.reports import Report
+from maasi_filter.reports import MOST_REPORTS, Report
 from maasi_filter.ros.conversions import report_from_ros
 from maasi_filter.ros.lifecycle_node import LockstepLifecycleNode
 from maasi_filter.ros.qos import LATCHED_ALL
@@ -51,6 +51,11 @@ class Reports:
                 self._node.reset()
         elif message not in self._used and message not in self._waiting:
             # A restarted filter repeats those that it knows.
+            if len(self._used) + len(self._waiting) >= MOST_REPORTS:
+                self._node.drop(
+                    'bad report', f'reports: allowed are {MOST_REPORTS} statements in one search'
+                )
+                return
             self._waiting.append(message)
             if not self._node.settings.lockstep:
                 self._use_waiting()

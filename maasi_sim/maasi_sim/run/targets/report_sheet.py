@@ -209,7 +209,7 @@ def _write_sectors(axes: Axes, parts: Sequence[Sector]) -> int:
     pod = total[1] / total[0] if total[0] > 0.0 else 0.0
     rows.append(['all', *(f'{100.0 * value:.1f} %' for value in (total[0], pod, total[1]))])
     line = _write_table(axes, 0, 'Cumulative probabilities by sector', heads, rows)
-    note = 'POA: of area before the search; POD: of detection; POS: of success'
+    note = 'POA: of area, with sightings; POD: of detection; POS: of success'
     _text(axes, 0.0, line + 0.5, note, 6.5, color=_GREY, va='center')
     return line + 1
 
