@@ -32,6 +32,10 @@ class Surface(NamedTuple):
     highest: float
 
 
+#: Flat ground, which hides nothing.
+FLAT = Surface(np.zeros((0, 0)), np.zeros(2), np.ones(2), np.zeros((0, 0)), 0.0, 0.0)
+
+
 @njit(cache=True, error_model='numpy')
 def height_at(surface: Surface, x: float, y: float) -> float:
     """Return the height at a position [m, map]; outside of the grid that of its border."""
@@ -224,6 +228,13 @@ def clearance_along(surface: Surface, start: FloatArray, end: FloatArray, enough
 def is_in_sight(surface: Surface, start: FloatArray, end: FloatArray) -> bool:
     """Return whether no ground is between two positions (3,), which may be on the ground."""
     return clearance_along(surface, start, end, -TOUCHING) >= -TOUCHING
+
+
+@njit(cache=True, error_model='numpy')
+def hides(surface: Surface, x: float, y: float, height: float, to_x: float, to_y: float) -> bool:
+    """Return whether the ground hides one of its points from a height above another one."""
+    start = np.array([x, y, height_at(surface, x, y) + height])
+    return not is_in_sight(surface, start, np.array([to_x, to_y, height_at(surface, to_x, to_y)]))
 
 
 @njit(cache=True, error_model='numpy')

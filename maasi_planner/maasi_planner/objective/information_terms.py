@@ -19,6 +19,7 @@ from maasi_planner.objective.predicted_measurements import (
     parts_of,
 )
 from maasi_planner.objective.settings import InformationSettings
+from maasi_planner.objective.sight import CLEAR, Sight, layer_of, miss_in_sight, remove_hidden
 from maasi_planner.objective.terms import IndexArray, Terms
 from maasi_planner.team import RobotView, TeamView
 
@@ -68,13 +69,20 @@ def _add_information(
 
 
 def _information(
-    view: RobotView, measured: Measurements, first: int, centres: FloatArray, d: int
+    view: RobotView,
+    measured: Measurements,
+    first: int,
+    centres: FloatArray,
+    d: int,
+    sight: Sight = CLEAR,
 ) -> FloatArray:
     """Return sum pi H' R^-1 H of one robot's measurements from `first` on, (W, C, d, d)."""
     out = np.zeros((len(measured.own), len(centres), d, d))
     lower: FloatArray = np.linalg.cholesky(view.sensor.covariance).astype(float)
     for where, part in parts_of(measured, len(centres)):
         chance = chances(part, first, centres)
+        if sight.hides:
+            remove_hidden(part, sight, layer_of(sight, view.height), centres, chance)
         owner, index, cluster = np.nonzero(chance)
         offsets = (centres[cluster] - part.positions[owner, index])[:, :d]
         # Nearer than the noise of the range, the linear model would be too optimistic.
@@ -100,15 +108,28 @@ def _nodes(team: TeamView, settings: InformationSettings, every_node: bool) -> N
     left = np.bincount(block.ravel(), (values * volumes).ravel()).astype(float)
     start, distance = lower + 0.5 * (stride - 1) * step, stride * step
     positions = start[:, None] + distance[:, None] * np.indices(shape).reshape(3, -1)
+    if stride > 1 and team.area.terrain is not None:
+        # A node that is left unseen may be hidden from where others are in sight.
+        positions[:2] = _least_seen(team, block.ravel(), positions[:2])
     unseen = left * (team.area.expected_targets / float(volumes.sum()))
     index = np.arange(len(left), dtype=np.int32).reshape(shape)
     return Nodes(index, start, distance, positions, unseen)
 
 
-def _without(nodes: Nodes, settled: Measurements) -> Nodes:
+def _least_seen(team: TeamView, block: IntArray, middles: FloatArray) -> FloatArray:
+    """Return the node of each block with most unseen targets, the nearest to its middle, (2, L)."""
+    nodes = team.exploration.nodes()
+    left = (team.exploration.values * team.exploration.cell_volumes()).ravel()
+    offsets = nodes - middles.T[block]
+    order = np.lexsort(((offsets * offsets).sum(axis=1), -left, block))
+    first = np.unique(block[order], return_index=True)[1]
+    return np.asarray(nodes[order[first]].T)
+
+
+def _without(nodes: Nodes, settled: Measurements, sight: Sight, layers: IntArray) -> Nodes:
     """Return the nodes that are still unseen after the measurements of robots that do not plan."""
     unseen = nodes.unseen.copy()
-    counts, node, miss = rows_of(settled, 0, nodes, False)
+    counts, node, miss = rows_of(settled, 0, nodes, False, sight, layers)
     for last, count in zip(counts.cumsum().tolist(), counts.tolist()):
         unseen[node[last - count : last]] *= miss[last - count : last]
     kept = np.flatnonzero(unseen > 0.0)
@@ -158,12 +179,17 @@ def _miss_near(
 
 @njit(cache=True)
 def rows_of(
-    measured: Measurements, first: int, nodes: Nodes, whole: bool
+    measured: Measurements,
+    first: int,
+    nodes: Nodes,
+    whole: bool,
+    sight: Sight,
+    layers: IntArray,
 ) -> tuple[IntArray, IndexArray, FloatArray]:
     """Return the nodes seen by the planned measurements from `first` on, by trajectory.
 
     These are the number of each (G,), the nodes in order, and the product of 1 - pi there (N,).
-    With `whole` each row has all nodes.
+    With `whole` each row has all nodes. layers (R,): of robots' heights in `sight`.
     """
     total, number = measured.own.shape[0], nodes.unseen.shape[0]
     counts, used = np.zeros(total, np.int64), 0
@@ -172,7 +198,10 @@ def rows_of(
     until = np.full(number, NEVER)
     at = nodes.positions[0], nodes.positions[1], nodes.positions[2]
     for g in range(total):
-        if measured.reach[measured.robot[g]] < np.inf:
+        if sight.surface.heights.size > 0:
+            count = miss_in_sight(measured, g, first, nodes, miss, seen, sight, layers)
+            seen[:count].sort()
+        elif measured.reach[measured.robot[g]] < np.inf:
             count = _miss_near(measured, g, first, nodes, miss, seen)
             seen[:count].sort()
         else:
@@ -205,7 +234,7 @@ class InformationTerms:
     """Terms of the candidates of each robot, then of all of them.
 
     settled: robots whose measurements do not depend on the choice, and these measurements; kinds
-    (R,): kinds of pi of the planning robots.
+    (R,): kinds of pi of the planning robots; sight: what terrain hides.
     """
 
     def __init__(
@@ -214,17 +243,22 @@ class InformationTerms:
         settings: InformationSettings,
         settled: tuple[Sequence[RobotView], Measurements],
         kinds: IntArray,
+        sight: Sight = CLEAR,
     ) -> None:
         self._d = d = team.dimension
+        self._sight = sight
         self._centres = np.zeros((len(team.clusters), 3))
-        self._nodes = _without(_nodes(team, settings, bool((kinds >= BOX).any())), settled[1])
+        layers = np.array([layer_of(sight, view.height) for view in settled[0]], np.int64)
+        nodes = _nodes(team, settings, bool((kinds >= BOX).any()))
+        self._nodes = _without(nodes, settled[1], sight, layers)
         for centre, cluster in zip(self._centres, team.clusters):
             centre[:d] = cluster.position[:d]
         self._base = np.zeros((len(self._centres), d, d))
         views, measured = settled
         for robot, view in enumerate(views):
             begin, end = np.searchsorted(measured.robot, [robot, robot + 1]).tolist()
-            gains = _information(view, part_of(measured, begin, end), 0, self._centres, d)
+            part = part_of(measured, begin, end)
+            gains = _information(view, part, 0, self._centres, d, sight)
             self._base += gains.sum(axis=0)
         self._mass = np.array([min(1.0, max(0.0, c.mass)) for c in team.clusters], float)
         covariance = np.array([c.covariance[:d, :d] for c in team.clusters], float)
@@ -236,8 +270,10 @@ class InformationTerms:
 
     def of(self, view: RobotView, planned: Measurements, first: int, whole: bool) -> Terms:
         """Return the terms of one robot's candidates for measurements from `first` on."""
-        counts, node, miss = rows_of(planned, first, self._nodes, whole)
-        gains = _information(view, planned, first, self._centres, self._d)
+        sight = self._sight
+        layers = np.full(len(planned.kind), layer_of(sight, view.height))
+        counts, node, miss = rows_of(planned, first, self._nodes, whole, sight, layers)
+        gains = _information(view, planned, first, self._centres, self._d, sight)
         if whole:
             known = np.ones(gains.shape[:2], np.bool_)
         else:

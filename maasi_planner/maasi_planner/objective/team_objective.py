@@ -11,6 +11,7 @@ from maasi_planner.objective.joint_search import PAIRS_LIMIT
 from maasi_planner.objective.paper_terms import paper_terms
 from maasi_planner.objective.predicted_measurements import path_ahead, planned_paths, predicted
 from maasi_planner.objective.settings import InformationSettings
+from maasi_planner.objective.sight import CLEAR, Sight
 from maasi_planner.objective.terms import Terms
 from maasi_planner.team import RobotView, TeamView, UsableCandidates
 
@@ -33,7 +34,11 @@ class TeamObjective:
     """
 
     def __init__(
-        self, team: TeamView, settings: InformationSettings, options: Mapping[str, UsableCandidates]
+        self,
+        team: TeamView,
+        settings: InformationSettings,
+        options: Mapping[str, UsableCandidates],
+        sight: Sight = CLEAR,
     ) -> None:
         informed = settings.objective == 'information'
         self.names = [name for name in team.planning() if name in options]
@@ -72,7 +77,7 @@ class TeamObjective:
         )
         if informed:
             others = [path.view for path in rest], settled
-            build = InformationTerms(team, settings, others, planned.kind)
+            build = InformationTerms(team, settings, others, planned.kind, sight)
             self.table, self.alone = self._by_robot(table, build, views, first)
             return
         centres = np.zeros((len(team.clusters), 3))

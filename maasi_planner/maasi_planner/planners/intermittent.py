@@ -8,6 +8,7 @@ from maasi_planner.motion.base import Trajectories
 from maasi_planner.objective.joint_search import PAIRS_LIMIT, search
 from maasi_planner.objective.predicted_measurements import CoarseTrajectories
 from maasi_planner.objective.settings import InformationSettings
+from maasi_planner.objective.sight import SightTables
 from maasi_planner.objective.team_objective import TeamObjective
 from maasi_planner.objective.terms import Terms
 from maasi_planner.planners.base import Planner, explain
@@ -33,6 +34,7 @@ class Intermittent(Planner):
         self._prospects: dict[str, float] = {}
         self._most: dict[str, float] = {}
         self._area: Area | None = None
+        self._sight = SightTables()
 
     def decide(self, team: TeamView) -> Decision:
         """See `Planner.decide`."""
@@ -48,7 +50,8 @@ class Intermittent(Planner):
         options = usable_options(team, decision, lambda name: self._centres(team, name), kept)
         if not options:
             return explain(decision)
-        objective = TeamObjective(team, self.settings, options)
+        sight = self._sight.of(team.exploration, team.robots.values())
+        objective = TeamObjective(team, self.settings, options, sight)
         chosen, decision.objective, decision.exact, decision.evaluated = search(
             objective.table, objective.bounds, self.settings
         )

@@ -16,6 +16,7 @@ from maasi_filter.arrays import BoolArray, FloatArray, IntArray
 from maasi_filter.models.pose import Pose
 from maasi_filter.unexplored_map import UnexploredMap
 from maasi_planner.candidates import half_view
+from maasi_planner.planners.lattice_sight import Cells, View, view_over
 from maasi_planner.team import RobotView, TeamView
 
 # A cell is omitted if others leave less than this share of its gain, or if its gain is less than
@@ -108,7 +109,7 @@ class Lattice:
 
     turn (d, d): axes of the cells, in columns; kernel: probability of detection in passing, by
     offset in cells; trust (n,): factor on the gain of a visit, which its user can reduce; area: of
-    all cells, in cells.
+    all cells, in cells. height: of robots above terrain, which hides ground from them [m].
     """
 
     def __init__(
@@ -117,6 +118,7 @@ class Lattice:
         lateral: FloatArray,
         detected: FloatArray,
         heading: float = 0.0,
+        height: float = 0.0,
     ) -> None:
         d, nodes = exploration.dimension, exploration.values.size
         self.turn, self.pitch = turned(heading, d), pitch_of(exploration, lateral, detected)
@@ -149,6 +151,11 @@ class Lattice:
         offsets = np.meshgrid(*(np.arange(-count, count + 1) for count in reach), indexing='ij')
         squared = sum((offset * width) ** 2 for offset, width in zip(offsets, widths))
         self.kernel = np.interp(np.sqrt(squared), lateral, detected, right=0.0)
+        self._view, terrain = View(self.kernel), exploration.area.terrain
+        if terrain is not None:
+            table = self._parts.indptr.astype(np.int64), self._parts.indices.astype(np.int64)
+            seen = Cells(self.shape, self._centres, exploration.nodes(), *table, self._parts.data)
+            self._view = view_over(seen, self.kernel, terrain.surface, height)
 
     def frame(self, robots: int) -> FloatArray:
         """Return the axes (d, d), in columns, in which tours of so many robots are planned."""
@@ -174,12 +181,19 @@ class Lattice:
 
     def choose(self, exploration: UnexploredMap, enough: int = 1) -> tuple[IntArray, FloatArray]:
         """Return at least `enough` cells that show the unseen area, and their gains (m,)."""
-        unseen = self.unseen(exploration)
-        return _choose(unseen, self.kernel, self.trust, OVERLAP, LEAST, enough)
+        return _choose(*self._now(exploration), self.trust, OVERLAP, LEAST, enough)
 
     def gains(self, exploration: UnexploredMap, chosen: IntArray) -> FloatArray:
         """Return the gain of each of some cells after those before it, (m,)."""
-        return self.trust[chosen] * _gains(self.unseen(exploration), self.kernel, chosen)
+        return self.trust[chosen] * _gains(*self._now(exploration), chosen)
+
+    def _now(self, exploration: UnexploredMap) -> tuple[FloatArray, View]:
+        """Return the share of all targets that is unseen in each cell; over terrain, node."""
+        if exploration.area.terrain is None:
+            return self.unseen(exploration), self._view
+        share = exploration.values * exploration.cell_volumes() / exploration.cell_volumes().sum()
+        left = self._parts @ (exploration.values.ravel() * self._sizes)
+        return share.reshape(-1, 1, 1), self._view._replace(whole=left > WHOLE * self._held)
 
 
 class _Samples(NamedTuple):
@@ -298,8 +312,19 @@ def _joined(held: FloatArray, middles: FloatArray) -> IntArray:
 
 
 @njit(cache=True)
-def _seen(unseen, kernel, cell, take):  # type: ignore[no-untyped-def]
+def _seen(unseen, view, cell, take):  # type: ignore[no-untyped-def]
     """Return how much is seen from a cell; `take` removes it."""
+    if len(view.begin) > 0:
+        total = 0.0
+        for row in range(view.begin[cell], view.begin[cell + 1]):
+            if view.behind[row] and view.whole[cell]:
+                continue
+            seen = unseen[view.node[row], 0, 0] * view.chance[row]
+            total += seen
+            if take:
+                unseen[view.node[row], 0, 0] -= seen
+        return total
+    kernel = view.kernel
     nx, ny, nz = unseen.shape
     a, b, c = kernel.shape
     i, j, k = cell // (ny * nz), cell // nz % ny, cell % nz
@@ -315,34 +340,35 @@ def _seen(unseen, kernel, cell, take):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _gains(unseen, kernel, chosen):  # type: ignore[no-untyped-def]
+def _gains(unseen, view, chosen):  # type: ignore[no-untyped-def]
     gains = np.empty(len(chosen))
     for number, cell in enumerate(chosen):
-        gains[number] = _seen(unseen, kernel, cell, True)
+        gains[number] = _seen(unseen, view, cell, True)
     return gains
 
 
 @njit(cache=True)
-def _choose(unseen, kernel, trust, overlap, least, enough):  # type: ignore[no-untyped-def]
+def _choose(unseen, view, trust, overlap, least, enough):  # type: ignore[no-untyped-def]
     """Choose the cell that sees most, as long as earlier ones have not seen most of that."""
-    alone = np.empty(unseen.size)
-    for cell in range(unseen.size):
-        alone[cell] = trust[cell] * _seen(unseen, kernel, cell, False)
-    chosen, gains = np.empty(unseen.size, np.int64), np.empty(unseen.size)
+    cells = len(trust)
+    alone = np.empty(cells)
+    for cell in range(cells):
+        alone[cell] = trust[cell] * _seen(unseen, view, cell, False)
+    chosen, gains = np.empty(cells, np.int64), np.empty(cells)
     number, least = 0, least * alone.max()
     # Gains only decrease: the largest one is computed again. Of equal ones
     # the first is chosen.
-    queue = [(-alone[cell], cell, -1) for cell in range(unseen.size) if alone[cell] > least]
+    queue = [(-alone[cell], cell, -1) for cell in range(cells) if alone[cell] > least]
     heapq.heapify(queue)
     while queue:
         bound, cell, fresh = heapq.heappop(queue)
         if -bound <= least:
             break
         if fresh < number:
-            left = trust[cell] * _seen(unseen, kernel, cell, False)
+            left = trust[cell] * _seen(unseen, view, cell, False)
             if number < enough or left >= overlap * alone[cell]:
                 heapq.heappush(queue, (-left, cell, number))
             continue
-        chosen[number], gains[number] = cell, trust[cell] * _seen(unseen, kernel, cell, True)
+        chosen[number], gains[number] = cell, trust[cell] * _seen(unseen, view, cell, True)
         number += 1
     return chosen[:number], gains[:number]
