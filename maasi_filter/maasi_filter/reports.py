@@ -23,7 +23,7 @@ from maasi_filter.geometry.environment import EnvironmentSettings, Zone
 from maasi_filter.geometry.geodesy import OriginSettings, to_map
 from maasi_filter.geometry.geojson import check_degrees
 from maasi_filter.geometry.polygons import is_wkt
-from maasi_filter.geometry.readers import read_shape, shapes_of_texts
+from maasi_filter.geometry.readers import DEGREES, read_shape, shapes_of_texts
 from maasi_filter.wording import number as shown
 from maasi_filter.wording import problems
 
@@ -186,14 +186,15 @@ def zone_on_map(zone: str, origin: OriginSettings) -> str:
     shape = _shape_of(zone)
     try:
         if isinstance(shape, str) and not is_wkt(shape):
-            longitude, latitude, *others = map(float, shape.split())
+            disc = Zone.model_validate(shape)
+            longitude, latitude, *height = disc.centre or []
             x, y = position_on_map(longitude, latitude, origin, 'zone')
-            return ' '.join(map(repr, [x, y, *others]))
+            return ' '.join(map(repr, [x, y, *height, disc.radius]))
         if not isinstance(shape, Mapping):
             shape = json.loads(shapely.to_geojson(read_shape(shape)))
         return str(read_shape(shape, origin))
     except ValueError as error:
-        raise ValueError(f'zone: {str(error).removeprefix("zone: ")}') from None
+        raise ValueError(f'zone: {_words(error).removeprefix("zone: ")}') from None
 
 
 def sighting(
@@ -233,8 +234,7 @@ def searched(
         values = {**dict(environment), 'keep_outs': [shape]}
         zones = EnvironmentSettings.model_validate(values).keep_outs
     except ValueError as error:
-        text = problems(error) if isinstance(error, ValidationError) else str(error)
-        raise ValueError(f'zone: {_KEY.sub("", text)}') from None
+        raise ValueError(f'zone: {_words(error)}') from None
     if not zones:
         raise ValueError('zone: read nothing, allowed is a polygon or x y radius')
     if any((zone.radius or 0.0) > _FARTHEST for zone in zones):
@@ -242,6 +242,12 @@ def searched(
     shape = shapely.union_all(list(map(level_shape, zones)))
     if not np.abs(shape.bounds).max() <= _FARTHEST:
         raise ValueError(f'zone: read coordinates beyond {_FARTHEST:g} m')
+    west, south, east, north = shape.bounds
+    if (length := max(east - west, north - south)) < DEGREES:
+        raise ValueError(
+            f'zone: is {length:.2g} m long in the map: are these degrees? Then set frame_id to '
+            f'{GEOGRAPHIC}'
+        )
     gap = float(area.border.distance(shape))
     if not shape.area > 0.0 or not area.border.intersection(shape).area > 0.0:
         centre = shapely.get_coordinates(shape.centroid)
@@ -260,7 +266,13 @@ def _shape_of(zone: str) -> Any:
     try:
         return shapes_of_texts([zone])[0]
     except ValueError as error:
-        raise ValueError(f'zone: {_KEY.sub("", str(error))}') from None
+        raise ValueError(f'zone: {_words(error)}') from None
+
+
+def _words(error: ValueError) -> str:
+    """Return what is wrong with a zone, without the key of an environment."""
+    text = problems(error) if isinstance(error, ValidationError) else str(error)
+    return _KEY.sub('', text)
 
 
 def _source(text: str) -> str:

@@ -393,6 +393,8 @@ def test_other_frames_are_refused(frame, text):
     [
         ('500 46 30', 'zone: read longitude 500, latitude 46, allowed are 180 and 90 degrees'),
         ('nan 46 30', "zone: got 'nan 46 30', allowed are"),
+        ('9 46 x', "zone: got '9 46 x', allowed are x y radius"),
+        ('9 46 -3', 'zone: radius: read -3.0, allowed is greater than 0'),
         ('POLYGON ((9 146, 9.1 146, 9.1 146.1, 9 146))', 'zone: feature 1: read longitude 9'),
         ('[[9, 46], [9.1, 46]]', 'zone: read [[9, 46], [9.1, 46]], allowed are at least 3'),
         ('POLYGON ((9 46, 9.1 46.1, 9.1 46, 9 46.1, 9 46))', 'zone: read POLYGON'),
@@ -403,4 +405,19 @@ def test_other_frames_are_refused(frame, text):
 def test_wrong_zones_in_degrees_are_refused(zone, text):
     with pytest.raises(ValueError) as caught:
         zone_on_map(zone, OriginSettings(latitude=46.0, longitude=9.0))
+    assert str(caught.value).startswith(text)
+
+
+@pytest.mark.parametrize(
+    ('zone', 'text'),
+    [
+        ('POLYGON ((9 46, 9.001 46, 9.001 46.001, 9 46))', 'zone: is 0.001 m long in the map: are'),
+        ('[[9, 46], [9.01, 46], [9, 46.05]]', 'zone: is 0.05 m long in the map: are these degrees'),
+        ('1 1 x', "zone: got '1 1 x', allowed are x y radius"),
+    ],
+)
+def test_wrong_zones_in_metres_are_refused(zone, text):
+    environment = EnvironmentSettings(**FIELD)
+    with pytest.raises(ValueError) as caught:
+        searched(zone, 0.5, '', environment, Area(environment))
     assert str(caught.value).startswith(text)

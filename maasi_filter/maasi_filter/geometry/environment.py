@@ -36,10 +36,12 @@ class Zone(Settings):
             return value
         if value[:1].isalpha():
             return {'polygon': value}
-        words = value.split()
-        if len(words) not in (3, 4):
+        try:
+            *centre, radius = map(float, value.split())
+        except ValueError:
+            centre, radius = [], 0.0
+        if len(centre) not in (2, 3):
             raise ValueError(f'got {value!r}, allowed are x y radius, x y z radius, or a polygon')
-        *centre, radius = map(float, words)
         return {'centre': centre, 'radius': radius}
 
     @model_validator(mode='after')

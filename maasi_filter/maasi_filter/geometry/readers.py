@@ -32,7 +32,7 @@ _MAPS = ('.yaml', '.yml')
 _IMAGES = ('.npy', '.png', '.jpg', '.jpeg', '.pgm', '.tif', '.tiff')
 FILES = (*FEATURE_FILES, *_MAPS, *_IMAGES, '.asc')
 _ROLE_OF = {'keep_outs': 'keep_out', 'obstacles': 'keep_out', 'prior': 'prior'}  # by key
-_DEGREES = 0.1  # shorter areas are in degrees [m]
+DEGREES = 0.1  #: shorter shapes are in degrees [m]
 _LARGEST = 10e9  # of an area in degrees [m^2]
 _FARTHEST = 100e3  # of an area from the origin of its map, which is flat [m]
 
@@ -182,7 +182,7 @@ def _check_area(area: BaseGeometry, drawn: bool, origin: Any) -> None:
             f'covers {area.area / 1e6:,.0f} km2, allowed are {_LARGEST / 1e6:,.0f}: are these '
             'metres, or is the latitude first? GeoJSON has the longitude first, in degrees'
         )
-    if not drawn and length < _DEGREES:
+    if not drawn and length < DEGREES:
         raise ValueError(
             f'is {length:.2g} m long, and corners are in metres of the map: are these degrees? '
             'Write them as GeoJSON'
