@@ -21,7 +21,8 @@ PATIENCE = '60'
 def end_launch(event: ProcessExited, context: LaunchContext) -> EmitEvent:
     """End the launch; an exception makes its exit status 1."""
     if event.returncode:
-        meaning = EXIT_CODES.get(event.returncode, 'unknown')
+        ended = f'ended by signal {-event.returncode}' if event.returncode < 0 else 'unknown'
+        meaning = EXIT_CODES.get(event.returncode, ended)
         raise RuntimeError(f'run_scenario exited with {event.returncode}: {meaning}')
     return EmitEvent(event=Shutdown(reason='the run has ended'))
 
