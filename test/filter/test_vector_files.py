@@ -8,6 +8,7 @@ import struct
 import subprocess
 import sys
 import warnings
+from contextlib import closing
 
 import numpy as np
 import pyogrio
@@ -103,7 +104,7 @@ def test_layers_are_roles_and_points_have_robots(tmp_path):
     points = [shapely.Point(9.9, 46.6), shapely.Point(9.899, 46.5995, 12.0)]
     names = {'name': ['start scout', 'depot'], 'Role': [None, 'charger'], 'robot': [None, 'scout']}
     write(path, points, layer='points', **names)
-    with sqlite3.connect(path) as table:
+    with closing(sqlite3.connect(path)) as table, table:
         table.execute('CREATE TABLE notes (id INTEGER PRIMARY KEY)')
         table.execute(
             'INSERT INTO gpkg_contents (table_name, data_type, identifier) '
@@ -181,7 +182,7 @@ def test_other_contents_are_refused(tmp_path):
     assert 'gone.gpkg: No such file' in refusal(tmp_path / 'gone.gpkg')
     assert 'gone.shp: No such file' in refusal(tmp_path / 'gone.shp')
     empty = tmp_path / 'empty.gpkg'
-    with sqlite3.connect(empty) as table:
+    with closing(sqlite3.connect(empty)) as table, table:
         table.execute('CREATE TABLE x (y)')
     assert 'empty.gpkg: is damaged, or no GPKG' in refusal(empty)
 
