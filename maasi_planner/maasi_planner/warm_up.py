@@ -4,6 +4,7 @@ import numpy as np
 
 from maasi_filter.geometry.area import Area
 from maasi_filter.geometry.environment import EnvironmentSettings
+from maasi_filter.geometry.terrain import Terrain
 from maasi_filter.models.detection import BoxDetection, ExponentialDetection
 from maasi_filter.models.sensor import Sensor
 from maasi_filter.records import Cluster
@@ -66,6 +67,12 @@ def warm_up() -> None:
                 )
             team = TeamView(0, 0.05, robots, clusters, exploration)
             _decide(team)
+            if dimension == 2:
+                # Over terrain, too.
+                over = UnexploredMap(exploration.bounds, 0.25)
+                over.area.terrain = Terrain(np.zeros((2, 2)), [0.0, 0.0], [2.0, 2.0])
+                for name in ('maasi', 'tour'):
+                    make_planner(name).decide(TeamView(0, 0.05, robots, clusters, over))
             # Large teams have separate kernels.
             view = team.robots['0']
             many = {f'{index}': view for index in range(PAIRS_LIMIT + 1)}
