@@ -188,3 +188,42 @@ def test_a_new_plan_never_collects_less_than_the_rest_of_the_old_one():
             gains.append(now[visited].sum() - before)
             assert gains[-1] >= -1e-9 * prizes.sum()
     assert np.mean(gains) > 0.0
+
+
+@pytest.mark.parametrize('seed', range(20))
+def test_later_flights_are_used_where_the_present_ones_do_not_suffice(seed):
+    rng = np.random.default_rng(seed)
+    robots, points = int(rng.integers(1, 4)), lattice(*rng.integers(4, 8, 2))
+    homes = rng.uniform(0.0, 4.0, (robots, 2))
+    starts = np.concatenate([rng.uniform(0.0, 4.0, (robots, 2)), homes])
+    ends, worths = np.concatenate([homes, homes]), np.repeat([1.0, 0.6], robots)
+    enough = np.full(robots, 3.0 * len(points))
+    for present in (enough, rng.uniform(0.0, 0.6, robots) * len(points) / robots):
+        budgets = np.concatenate([present, rng.uniform(0.5, 1.5, robots) * len(points) / robots])
+        paths = plan_routes(points, np.ones(len(points)), starts, budgets, ends, worths=worths)
+        visited = np.concatenate(paths)
+        assert len(visited) == len(set(visited.tolist()))
+        for start, path, budget, end in zip(starts, paths, budgets, ends):
+            most = max(budget, np.hypot(*(end - start)))
+            assert arrivals(points, start, path, end)[1] <= most + 1e-9
+        later = sum(map(len, paths[robots:]))
+        assert later == 0 if present is enough else later > 0
+
+
+def test_flights_that_are_planned_together_need_fewer_metres():
+    """Against flights that each collect as much as possible."""
+    metres = np.zeros(2)
+    for seed in range(8):
+        rng = np.random.default_rng(seed)
+        points, home = lattice(10, 10), np.array([[rng.uniform(0.0, 9.0), 0.0]])
+        for kind, number in enumerate((1, 5)):
+            left, budget = np.arange(100), 26.0
+            while len(left):
+                homes = np.repeat(home, number, axis=0)
+                budgets, worths = np.full(number, budget), 1.0 - 0.5 * np.arange(number) / number
+                path, *_ = plan_routes(
+                    points[left], np.ones(len(left)), homes, budgets, homes, worths=worths
+                )
+                metres[kind] += arrivals(points[left], home[0], path, home[0])[1]
+                left = np.delete(left, path)
+    assert metres[1] < 0.95 * metres[0]

@@ -57,6 +57,7 @@ def plan_routes(
     speeds: FloatArray | None = None,
     known: list[IntArray] | None = None,
     effort: float = 1.0,
+    worths: FloatArray | None = None,
 ) -> list[IntArray]:
     """Return the nodes that each robot visits, in order.
 
@@ -82,6 +83,9 @@ def plan_routes(
         keep to the budgets, the result never collects less than they do.
     effort : float, optional
         Factor on the number of tries of the search.
+    worths : (r,) array, optional
+        Share of a prize that each robot gains, 0 to 1, first those with 1; default: 1. Rows with
+        less are later flights, which are used where the present ones do not suffice.
     """
     used, robots = np.flatnonzero(np.asarray(prizes) > 0.0), len(budgets)
     endless = bool(np.isinf(budgets).any())
@@ -113,18 +117,19 @@ def plan_routes(
     # A robot moves to its end in any case.
     direct = [gap_between(points, free, n + k, n + robots + k) for k in range(robots)]
     limits = np.maximum(budgets, direct) * (1.0 + 1e-12)
-    early = _terms(limits, 0.0, rates, 0.0, OVER * prize.sum() * rates.max())
-    begun, old = [], [used[:0]] * robots
-    if known is not None and any(map(len, known)):
+    worth = np.ones(robots) if worths is None else worths
+    present = int((worth == 1.0).sum())
+    now = np.where(worth == 1.0, limits, 0.0)
+    early = _terms(now, 0.0, rates, 0.0, OVER * prize.sum() * rates.max())
+    old = [used[:0]] * robots
+    if known is not None:
         old = [np.searchsorted(used, path[np.isin(path, used)]) for path in known]
-        begun.append(make_routes(places, old))
-    for axes in (np.arange(d), np.array([1, 0, *range(2, d)])):
-        begun.append(make_routes(places, _shared(places, _lanes(points[:n][:, axes]), robots)))
+    begun = _begin(places, old, present, d)
     # A node has two legs, each at least as long as to the nearest node.
     legs = np.zeros(n)
     if n > 1:
         legs = np.sort(np.linalg.norm(points[:n] - points[places.near[:n, 0]], axis=1))
-    whole = bool(legs[: max(n - robots, 0)].sum() <= limits.sum())
+    whole = bool(legs[: max(n - robots, 0)].sum() <= now.sum())
     if whole:
         for found in begun:
             _put(places, found, early, np.arange(n))
@@ -133,9 +138,13 @@ def plan_routes(
         # Of equal ones the first: known paths, or straight ones.
         first = next(i for i, cost in enumerate(costs) if cost <= min(costs) * (1.0 + 1e-6))
         routes = begun[first]
-    if not whole or (routes.lengths() > limits).any():
-        routes = _within(places, begun, make_routes(places, old), limits, rates, effort)
-    if routes.counts.sum() == n:
+        whole = bool((routes.lengths() <= now).all())
+    if not whole:
+        if present < robots:
+            begun = _begin(places, old, robots, d)
+        terms = _terms(limits, PRICE, 0.0, worth, OVER)
+        routes = _within(places, begun, make_routes(places, old), terms, rates, effort)
+    if whole or (present == robots and routes.counts.sum() == n):
         heat = max(sum(cost_now(routes, early, k) for k in range(robots)) / n, 1e-300)
         tries = int(effort * min(TRIES_EARLY[0] * n, TRIES_EARLY[1]))
         _search(places, routes, early, tries, HOT_EARLY * heat, COLD_EARLY * heat)
@@ -143,7 +152,11 @@ def plan_routes(
 
 
 def _terms(
-    limits: FloatArray, price: float, rate: float | FloatArray, worth: float, over: float
+    limits: FloatArray,
+    price: float,
+    rate: float | FloatArray,
+    worth: float | FloatArray,
+    over: float,
 ) -> FloatArray:
     """Return what counts in the cost of each route (r, 5).
 
@@ -153,19 +166,34 @@ def _terms(
     return np.stack(np.broadcast_arrays(price, rate, worth, limits, over), axis=1)
 
 
+def _begin(places: Places, known: list[IntArray], present: int, dimension: int) -> list[Routes]:
+    """Return known routes, and lanes along two axes that the present robots share."""
+    robots = len(known)
+    n = len(places.near) - robots
+    found = [known] if any(map(len, known)) else []
+    for axes in (np.arange(dimension), np.array([1, 0, *range(2, dimension)])):
+        lanes = _shared(places, _lanes(places.points[:n][:, axes]), present)
+        found.append(lanes + [lanes[0][:0]] * (robots - present))
+    return [make_routes(places, rows) for rows in found]
+
+
 def _within(
     places: Places,
     begun: list[Routes],
     known: Routes,
-    limits: FloatArray,
+    terms: FloatArray,
     rates: FloatArray,
     effort: float,
 ) -> Routes:
-    """Return routes within limits [m]: the best of begun and known ones, after a search."""
-    robots, n = len(limits), len(places.near) - len(limits)
+    """Return routes within limits: the best of begun and known ones, after a search.
+
+    terms: prices of metres are in mean prizes of a metre.
+    """
+    robots, n = len(terms), len(places.near) - len(terms)
+    limits, worth = terms[:, 3], terms[:, 2]
     longest = max(max(found.lengths().max() for found in begun), 1e-9)
     usual = places.prizes.sum() / max(begun[-1].lengths().sum(), 1e-9)
-    terms = _terms(limits, PRICE * usual, 0.0, 1.0, OVER * usual)
+    terms = terms * [usual, 1.0, 1.0, 1.0, usual]
     start, least = known, math.inf
     empty = make_routes(places, [np.zeros(0, np.int64)] * robots)
     for rows in (known, *begun, empty):
@@ -180,12 +208,15 @@ def _within(
     tries = int(effort * min(TRIES[0] * n, TRIES[1]))
     _search(places, start, terms, tries, HOT * mean, COLD * mean)
     if (known.lengths() <= limits).all():
-        prizes = [sum(places.prizes[row].sum() for row in r.visited()) for r in (start, known)]
-        if prizes[0] <= prizes[1]:
+        gained, had = (
+            sum(w * places.prizes[row].sum() for w, row in zip(worth, found.visited()))
+            for found in (start, known)
+        )
+        if gained <= had:
             return known
     # In an order in which they are collected early.
     rate = 0.01 / longest * rates / rates.max()
-    improve(places, start, _terms(limits, 0.01 * usual, rate, 1.0, OVER * usual), True)
+    improve(places, start, _terms(limits, 0.01 * usual, rate, worth, OVER * usual), True)
     return start
 
 
@@ -205,7 +236,7 @@ def _lanes(points: FloatArray) -> IntArray:
 
 
 def _shared(places: Places, order: IntArray, robots: int) -> list[IntArray]:
-    """Return equal parts of an order of nodes, each robot that which begins or ends nearest."""
+    """Return equal parts of an order of nodes, for each robot the one with the nearest end."""
     parts, rows = np.array_split(order, robots), []
     for start in range(len(order), len(order) + robots):
         gaps = [

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from maasi_filter.arrays import FloatArray
+from maasi_filter.arrays import FloatArray, IntArray
 from maasi_filter.geometry.area import Area
 from maasi_planner.planners.base import Planner, explain
 from maasi_planner.planners.detour import PASSES, others_move, past_standing
+from maasi_planner.planners.flights import Flights, flights_of
 from maasi_planner.planners.lattice import Lattice, lanes_of
 from maasi_planner.planners.options import affordable, waiting_places
 from maasi_planner.planners.orienteering import plan_routes
@@ -56,6 +57,8 @@ class Tour(Planner):
         self.points = np.zeros((0, 0))
         self._planned = np.zeros(0)
         self.routes: dict[str, list[int]] = {}
+        # Routes of later flights, after charging.
+        self._later: dict[str, list[list[int]]] = {}
         # Last target of each robot, and robots that could not afford one at this step.
         self._target: dict[str, FloatArray] = {}
         self._refused: set[str] = set()
@@ -131,7 +134,11 @@ class Tour(Planner):
         lattice, names, heavy = self._lattice_of(team), self.searching(team), self.heavy(team)
         number = len(self._chosen)
         before = {
-            name: self._chosen[[i for i in route if i < number]].tolist()
+            name: [
+                self._chosen[[i for i in flight if i < number]].tolist()
+                for flight in (route, *self._later.get(name, []))
+                if flight
+            ]
             for name, route in self.routes.items()
         }
         self._chosen, gains = lattice.choose(team.exploration, ENOUGH * len(names))
@@ -140,36 +147,49 @@ class Tour(Planner):
         masses = [item.mass for item in heavy]
         self._planned = np.concatenate([team.area.expected_targets * gains, masses])
         prizes = self._planned.copy()
-        starts, ends, budgets = [], [], []
         for name in names:
-            view = team.robots[name]
-            path = None if view.planning else view.remaining_path
-            end = path[-1] if path is not None and len(path) else view.state.pose.position
-            starts.append(end[: team.dimension])
-            budget, home = np.inf, end
-            if view.endurance is not None:
-                budget, home = view.endurance.range_from(end)
-            budgets.append(budget)
-            # Unlimited tours need not end at home.
-            ends.append(home[: team.dimension] + (0.0 if np.isfinite(budget) else np.nan))
             if name in self._target:
                 # The robot is on its path there.
                 gaps = np.linalg.norm(self.points - self._target[name], axis=1)
                 prizes[gaps < SAME * lattice.pitch] = 0.0
-        speeds = np.array([team.robots[name].motion.settings.speed for name in names])
-        homes = np.array(ends) if np.isfinite(budgets).any() else None
-        # Lanes are those of the lattice; budgets are true lengths.
-        frame = lattice.turn if homes is not None else lattice.frame(len(names))
-        points, origins = self.points @ frame, np.array(starts) @ frame
-        homes = None if homes is None else homes @ frame
+        flights = flights_of(team, names, self.points, lattice.pitch)
         rows = {cell: row for row, cell in enumerate(self._chosen.tolist())}
         known = [
-            np.array([rows[i] for i in before.get(name, []) if i in rows], np.int64)
-            for name in names
+            np.array([rows[i] for i in cells if i in rows], np.int64)
+            for cells in _flown_again(before, flights.names)
         ]
-        routes = plan_routes(points, prizes, origins, np.array(budgets), homes, speeds, known)
+        routes = self._routes(flights, prizes, known)
         self.routes = {name: route.tolist() for name, route in zip(names, routes)}
+        self._later = {name: [] for name in names}
+        for name, route in zip(flights.names[len(names) :], routes[len(names) :]):
+            self._later[name].append(route.tolist())
         return self._planned
+
+    def _routes(
+        self, flights: Flights, prizes: FloatArray, known: list[IntArray]
+    ) -> list[IntArray]:
+        """Return the routes of all flights, in straight lanes if that is possible."""
+        assert self._lattice is not None
+        turn, robots = self._lattice.turn, len(set(flights.names))
+        straight = self._lattice.frame(robots)
+        single = len(flights.names) == robots
+        for frame in (straight, turn) if single else (turn,):
+            ends = flights.ends @ frame if flights.limited else None
+            routes = plan_routes(
+                self.points @ frame,
+                prizes,
+                flights.starts @ frame,
+                flights.budgets,
+                ends,
+                flights.speeds,
+                known,
+                worths=flights.worths,
+            )
+            # Budgets are true lengths, which are shorter than those in the straight frame.
+            all_visited = sum(map(len, routes)) == np.count_nonzero(prizes > 0.0)
+            if all_visited or not flights.limited or np.array_equal(frame, turn):
+                break
+        return routes
 
     def _next(
         self,
@@ -282,3 +302,9 @@ class Tour(Planner):
         low, high = team.bounds.T
         end[: team.dimension] = np.clip(end[: team.dimension], low, high)
         return end, whole
+
+
+def _flown_again(before: dict[str, list[list[int]]], names: list[str]) -> list[list[int]]:
+    """Return the known cells of each flight, in the order of names; robots have several."""
+    left = {name: iter(flights) for name, flights in before.items()}
+    return [next(left.get(name, iter(())), []) for name in names]
