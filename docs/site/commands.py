@@ -47,6 +47,8 @@ SCRIPTS = {
     '`./scripts/colcon_test`': 'tests each package alone, as `colcon test` does',
     '`./scripts/dependencies`': 'runs the fast tests with the newest or oldest dependencies',
     '`./scripts/docs`': 'builds the documentation site; `--write` writes the generated pages',
+    '`./scripts/release`': 'builds and checks what goes to PyPI '
+    '([how_to/release.md](how_to/release.md))',
     '`./scripts/python`': 'runs Python in the environment of the suite',
     '`./scripts/shell`': 'opens a shell, or runs a command, in the environment of the suite',
 }
