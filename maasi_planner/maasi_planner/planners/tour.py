@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from maasi_filter.arrays import FloatArray, IntArray
+from maasi_filter.arrays import FloatArray
 from maasi_filter.geometry.area import Area
 from maasi_planner.planners.base import Planner, explain
 from maasi_planner.planners.detour import PASSES, others_move, past_standing
-from maasi_planner.planners.flights import Flights, flights_of
+from maasi_planner.planners.flights import flights_of
 from maasi_planner.planners.lattice import Lattice, lanes_of
 from maasi_planner.planners.options import affordable, waiting_places
 from maasi_planner.planners.orienteering import plan_routes
@@ -158,38 +158,23 @@ class Tour(Planner):
             np.array([rows[i] for i in cells if i in rows], np.int64)
             for cells in _flown_again(before, flights.names)
         ]
-        routes = self._routes(flights, prizes, known)
+        # Lanes are those of the lattice; budgets are true lengths.
+        frame = lattice.turn if flights.limited else lattice.frame(len(names))
+        routes = plan_routes(
+            self.points @ frame,
+            prizes,
+            flights.starts @ frame,
+            flights.budgets,
+            flights.ends @ frame if flights.limited else None,
+            flights.speeds,
+            known,
+            worths=flights.worths,
+        )
         self.routes = {name: route.tolist() for name, route in zip(names, routes)}
         self._later = {name: [] for name in names}
         for name, route in zip(flights.names[len(names) :], routes[len(names) :]):
             self._later[name].append(route.tolist())
         return self._planned
-
-    def _routes(
-        self, flights: Flights, prizes: FloatArray, known: list[IntArray]
-    ) -> list[IntArray]:
-        """Return the routes of all flights, in straight lanes if that is possible."""
-        assert self._lattice is not None
-        turn, robots = self._lattice.turn, len(set(flights.names))
-        straight = self._lattice.frame(robots)
-        single = len(flights.names) == robots
-        for frame in (straight, turn) if single else (turn,):
-            ends = flights.ends @ frame if flights.limited else None
-            routes = plan_routes(
-                self.points @ frame,
-                prizes,
-                flights.starts @ frame,
-                flights.budgets,
-                ends,
-                flights.speeds,
-                known,
-                worths=flights.worths,
-            )
-            # Budgets are true lengths, which are shorter than those in the straight frame.
-            all_visited = sum(map(len, routes)) == np.count_nonzero(prizes > 0.0)
-            if all_visited or not flights.limited or np.array_equal(frame, turn):
-                break
-        return routes
 
     def _next(
         self,
