@@ -201,10 +201,10 @@ def _with_types(layer: Layer, path: Path) -> Layer:
         key: Key = ('robots', name)
         types += [read_layer(files[item], key) for item in ('all', kind) if item in files]
     result = merge(*types, layer)
-    for name, key in measured.items():
+    for name, taken in measured.items():
         other = 'sensor' if result.data['robots'][name].get('camera') is None else 'camera'
-        if key not in ('', other):
-            problem = f"robots.{name}.{key}: read 'external', but it measures by its {other}"
+        if taken not in ('', other):
+            problem = f"robots.{name}.{taken}: read 'external', but it measures by its {other}"
             raise ScenarioError(layer.located(f'{problem}; allowed is {other}: external'))
     return result
 
