@@ -20,7 +20,7 @@ from PIL import Image
 
 from maasi_filter.colours import FOUND, KEEP_OUT, POTENTIAL, ROBOTS, SEEN
 from maasi_sim.run.report_panels import UNSEEN
-from maasi_sim.run.view.search_page import event_log
+from maasi_sim.run.view.recording import event_log
 from maasi_sim.run.view.video import GIF_RATE, RATE, write_video
 from maasi_sim.scenario import load_scenario
 from maasi_sim.search import search

@@ -80,7 +80,7 @@ def search(
         page = None
         if view:
             # Deferred: only a page needs a web server.
-            from maasi_sim.run.view.search_page import SearchPage
+            from maasi_sim.run.view.live_view import SearchPage
 
             page = SearchPage(running.log)
         result = running.run(most_measurements)

@@ -21,7 +21,7 @@ class SearchResult(RunLog):
         """
         # Deferred: only a page needs a web server.
         from maasi_sim.run.view.page_file import write_replay
-        from maasi_sim.run.view.search_page import event_log
+        from maasi_sim.run.view.recording import event_log
 
         path = Path(path)
         write_replay(event_log(self, path.stem), path)

@@ -12,7 +12,7 @@ from maasi_sim.experiments.campaign import Workers, plan
 from maasi_sim.experiments.outputs import write_outputs
 from maasi_sim.experiments.papers import experiments
 from maasi_sim.experiments.runs import load_run
-from maasi_sim.run.view.search_page import event_log
+from maasi_sim.run.view.recording import event_log
 from maasi_sim.scenario.loading import scenario_from_values
 from maasi_sim.search import search
 

@@ -25,9 +25,8 @@ from maasi_sim.run.bag import BagWriter, load_types
 from maasi_sim.run.missions import load_mission
 from maasi_sim.run.view.event_log import EventLog, line, thin
 from maasi_sim.run.view.event_maker import ENDED, LEFT, SILENT, EventMaker
-from maasi_sim.run.view.recording import facts_for, read_events
+from maasi_sim.run.view.recording import event_log, facts_for, read_events
 from maasi_sim.run.view.scene import empty_scene, scene_of, scene_of_facts
-from maasi_sim.run.view.search_page import event_log
 from maasi_sim.search import search
 
 ROOT = Path(__file__).resolve().parents[2]

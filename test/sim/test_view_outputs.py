@@ -18,8 +18,8 @@ from maasi_sim.run.view import video, view_run
 from maasi_sim.run.view.event_log import EventLog
 from maasi_sim.run.view.event_maker import EventMaker
 from maasi_sim.run.view.page_file import FOLDER, write_replay
+from maasi_sim.run.view.recording import event_log
 from maasi_sim.run.view.scene import scene_of
-from maasi_sim.run.view.search_page import event_log
 from maasi_sim.scenario.loading import config_folder
 from maasi_sim.search import search
 

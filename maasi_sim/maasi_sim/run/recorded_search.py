@@ -24,7 +24,7 @@ from maasi_sim.run.targets.report import explored_after
 from maasi_sim.run.targets.report_sheet import report_pdf
 from maasi_sim.run.targets.tables import csv_text, found_rows
 from maasi_sim.run.view.page_file import REPLAY, write_replay
-from maasi_sim.run.view.search_page import event_log
+from maasi_sim.run.view.recording import event_log
 from maasi_sim.scenario.layering import Key, ScenarioError
 from maasi_sim.scenario.loading import load_scenario
 from maasi_sim.scenario.schema import Scenario, planner_settings

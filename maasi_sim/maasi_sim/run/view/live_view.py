@@ -1,4 +1,4 @@
-"""The page of a running run, from its messages."""
+"""The page of a run in progress: of nodes, from their messages, or of a search in one process."""
 
 import contextlib
 import os
@@ -11,6 +11,7 @@ from typing import Any
 
 from maasi_sim.run.bag import load_types
 from maasi_sim.run.facts import Said
+from maasi_sim.run.log import RunLog
 from maasi_sim.run.message_facts import MARKERS
 from maasi_sim.run.run_options import ViewOptions
 from maasi_sim.run.topics import time_at
@@ -19,6 +20,7 @@ from maasi_sim.run.view.event_maker import EventMaker
 from maasi_sim.run.view.page_file import open_browser
 from maasi_sim.run.view.pictures import IMAGES
 from maasi_sim.run.view.recording import facts_for
+from maasi_sim.run.view.scene import scene_of
 from maasi_sim.run.view.server import Commander, Hub, ViewServer
 
 _FAREWELL = 2.0  # time for browsers to receive the last events [s]
@@ -155,3 +157,22 @@ class RunPage(LiveView):
         self.finish('the run has ended' if self._waits else 'the view was closed')
         if self._control is not None:
             self._control.close()
+
+
+class SearchPage(LiveView):
+    """Serves the page of a running search in this process."""
+
+    def __init__(self, log: RunLog) -> None:
+        super().__init__(scene_of('search', log.scenario, log.seed))
+        self._log = log
+        self.announce(print)
+        for fact in log.facts:
+            self.put(EventMaker.add, fact)
+        log.listeners.append(lambda fact: self.put(EventMaker.add, fact))
+
+    def end(self) -> None:
+        """Show how the search ended and stop serving."""
+        reason = self._log.end_reason
+        self.put(EventMaker.end, reason)
+        self.finish(f'ended: {reason}')
+        self.close()

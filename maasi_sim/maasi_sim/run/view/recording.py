@@ -1,13 +1,14 @@
-"""The page events of a recording."""
+"""The page events of a recording, or of a search in one process."""
 
 from collections.abc import Callable
 from pathlib import Path
 
 from maasi_sim.run.bag import Bag, BagError
+from maasi_sim.run.log import RunLog
 from maasi_sim.run.message_facts import MARKERS, STEP, MessageFacts, is_read
 from maasi_sim.run.view.event_log import Event, EventLog, Scene
 from maasi_sim.run.view.event_maker import EventMaker
-from maasi_sim.run.view.scene import empty_scene, scene_of_facts
+from maasi_sim.run.view.scene import empty_scene, scene_of, scene_of_facts
 
 _PROGRESS = 1000  # messages between two progress reports
 
@@ -45,3 +46,13 @@ def read_events(path: Path, progress: Callable[[float], None] | None = None) -> 
         maker.end()
     # Parts that became known later belong to the scene of a replay.
     return EventLog(maker.scene, [event for event in events if event[1] != 'scene'])
+
+
+def event_log(log: RunLog, name: str = 'search') -> EventLog:
+    """Return the event log of a search."""
+    events: list[Event] = []
+    maker = EventMaker(scene_of(name, log.scenario, log.seed), events.append)
+    for fact in log.facts:
+        maker.add(fact)
+    maker.end(log.end_reason)
+    return EventLog(maker.scene, events)

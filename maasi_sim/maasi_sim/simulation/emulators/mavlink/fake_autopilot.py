@@ -81,7 +81,7 @@ class FakeAutopilot:
         self.charge = settings.charge
         self.set_mode('MANUAL' if self.firmware is PX4_COPTER else 'STABILIZE')
         self._first_mode = self.mode
-        self.gnss = FakeGnss(sender, settings.second_gnss)
+        self.gnss: FakeGnss = FakeGnss(sender, settings.second_gnss)
         self.muted: set[str] = set()
         self.frozen: tuple[float, ...] | None = None
         # Error of the estimated height, and true place of the EKF's origin [m].
@@ -301,15 +301,6 @@ class FakeAutopilot:
             state = mavlink.MAV_LANDED_STATE_TAKEOFF
         self._sender.extended_sys_state_send(mavlink.MAV_VTOL_STATE_UNDEFINED, state)
 
-    def _send_estimator(self) -> None:
-        self.gnss.send_estimator(self.now, self.ready)
-
-    def _send_gnss(self) -> None:
-        self.gnss.send_first(self.now)
-
-    def _send_second_gnss(self) -> None:
-        self.gnss.send_second(self.now)
-
     def handle(self, message: Any) -> None:
         """Take a message."""
         if self.crashed:
@@ -458,9 +449,6 @@ class FakeAutopilot:
         head = self._milliseconds, mavlink.MAV_FRAME_LOCAL_NED, mask
         self._sender.position_target_local_ned_send(*head, *numbers, *[0.0] * 5)
 
-    def _send_fence_status(self) -> None:
-        self.fence.send_status()
-
 
 _MESSAGES: dict[str, Callable[[FakeAutopilot], None]] = {
     'HEARTBEAT': FakeAutopilot._send_heartbeat,
@@ -468,11 +456,11 @@ _MESSAGES: dict[str, Callable[[FakeAutopilot], None]] = {
     'LOCAL_POSITION_NED': FakeAutopilot._send_position,
     'BATTERY_STATUS': FakeAutopilot._send_battery,
     'EXTENDED_SYS_STATE': FakeAutopilot._send_landed,
-    'EKF_STATUS_REPORT': FakeAutopilot._send_estimator,
-    'GPS_RAW_INT': FakeAutopilot._send_gnss,
-    'GPS2_RAW': FakeAutopilot._send_second_gnss,
+    'EKF_STATUS_REPORT': lambda self: self.gnss.send_estimator(self.now, self.ready),
+    'GPS_RAW_INT': lambda self: self.gnss.send_first(self.now),
+    'GPS2_RAW': lambda self: self.gnss.send_second(self.now),
     'POSITION_TARGET_LOCAL_NED': FakeAutopilot._send_target,
-    'FENCE_STATUS': FakeAutopilot._send_fence_status,
+    'FENCE_STATUS': lambda self: self.fence.send_status(),
 }
 _HANDLERS: dict[str, Callable[[FakeAutopilot, Any], None]] = {
     'HEARTBEAT': FakeAutopilot._on_heartbeat,
