@@ -1,6 +1,5 @@
 // Potential targets as a heat map: density from their Gaussians.
 
-import { themed } from './colours.js';
 import { FloorGrid } from './floor_grid.js';
 import { number } from './text.js';
 
@@ -11,7 +10,8 @@ const REACH = 3.5;
 
 export class Belief {
   constructor() {
-    this.floor = new FloorGrid(true);
+    const shade = (share, low, high) => [...low.map((value, index) => value + share * (high[index] - value)), share && 60 + 170 * share];
+    this.floor = new FloorGrid(LEVELS, ['--heat-low', '--heat-high'], shade, true);
     this.events = [];
   }
 
@@ -63,17 +63,7 @@ export class Belief {
 
   draw(view, log, time) {
     this.update(log, time);
-    if (this.isEmpty) return;
-    const key = themed('--heat-low') + themed('--heat-high');
-    if (this.key !== key) {
-      const [low, high] = ['--heat-low', '--heat-high'].map((name) => themed(name).split(',').map(Number));
-      this.colours = Array.from({ length: LEVELS + 1 }, (_, level) => {
-        const share = level / LEVELS;
-        return [...low.map((value, index) => value + share * (high[index] - value)), level ? 60 + 170 * share : 0].map(Math.round);
-      });
-      this.key = key;
-    }
-    this.floor.draw(view, this.cells, this.levels, this.colours);
+    if (!this.isEmpty) this.floor.draw(view, this.cells, this.levels);
   }
 
   // Return the density at a position as text.

@@ -45,18 +45,8 @@ export function drawBuildings(view, log, time) {
   boxes.sort((a, b) => b.depth - a.depth);
   for (const item of boxes) {
     context.lineWidth = item.wide ? 2.5 : 1;
-    if (camera.spatial) {
-      box(context, camera, item.sides, item.fill, item.stroke);
-      if (item.object !== undefined) drawFaces(view, log, visited, item);
-    } else {
-      const [[left, right], [low, high]] = item.sides;
-      path(context, camera, [[left, low], [right, low], [right, high], [left, high]], true);
-      context.fillStyle = item.fill;
-      context.strokeStyle = item.stroke;
-      context.fill();
-      context.stroke();
-      if (item.object !== undefined) drawFaces(view, log, visited, item);
-    }
+    box(context, camera, item.sides, item.fill, item.stroke);
+    if (item.object !== undefined) drawFaces(view, log, visited, item);
   }
   context.lineWidth = 1;
   drawLinks(view, log, time);

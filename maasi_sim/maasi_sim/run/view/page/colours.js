@@ -32,6 +32,14 @@ export function scaleColour(share) {
   return `rgb(${mixed.join(',')})`;
 }
 
+// Return the colour of each candidate by its objective; none where it is not allowed.
+export function objectiveColours(candidates) {
+  const values = candidates.map((item) => item[6]);
+  const allowed = values.filter((value) => value !== null);
+  const [low, high] = [Math.min(...allowed), Math.max(...allowed)];
+  return values.map((value) => value !== null && scaleColour(high > low ? (value - low) / (high - low) : 1));
+}
+
 const known = new Map();
 
 // Return a colour of the theme, cached.

@@ -1,6 +1,7 @@
 // The curves of finds and of the expected number left over time.
 
 import { FOUND, POTENTIAL, themed } from './colours.js';
+import { prepared } from './shapes.js';
 
 export class Curve {
   constructor(canvas) {
@@ -20,8 +21,8 @@ export class Curve {
     const [width, height] = [canvas.clientWidth, canvas.clientHeight];
     const key = [width, height, ratio, log.scene.name, log.size, document.documentElement.dataset.theme].join(' ');
     if (key !== this.key) {
-      for (const item of [canvas, picture]) [item.width, item.height] = [width * ratio, height * ratio];
-      this.plot(log, picture.getContext('2d'), width, height, ratio);
+      [canvas.width, canvas.height] = [width * ratio, height * ratio];
+      this.plot(log, prepared(picture, width, height), width, height);
       this.key = key;
     }
     const context = canvas.getContext('2d');
@@ -38,7 +39,7 @@ export class Curve {
     context.stroke();
   }
 
-  plot(log, context, width, height, ratio) {
+  plot(log, context, width, height) {
     const found = log.isOfBuildings
       ? { times: log.visits.times, events: log.visits.times.map((_, index) => index + 1) }
       : log.totals;
@@ -50,8 +51,6 @@ export class Curve {
     const high = height - 26;
     const x = (time) => left + (wide * time) / (log.duration || 1);
     const y = (value) => top + high * (1 - value / most);
-    context.setTransform(ratio, 0, 0, ratio, 0, 0);
-    context.clearRect(0, 0, width, height);
     context.strokeStyle = themed('--line');
     context.strokeRect(left, top, wide, high);
     context.fillStyle = themed('--quiet');

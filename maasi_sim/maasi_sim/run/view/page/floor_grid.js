@@ -1,14 +1,29 @@
 // A grid of coloured floor cells, from above as an image, else cell by cell.
 
+import { themed } from './colours.js';
+
 export class FloorGrid {
-  constructor(isSmooth = false) {
-    this.isSmooth = isSmooth;
+  // `shade`: red, green, blue and opacity (to 255) of a share of `most`, from colours of the theme.
+  constructor(most, names, shade, isSmooth = false) {
+    Object.assign(this, { most, names, shade, isSmooth });
     this.canvas = document.createElement('canvas');
   }
 
-  // Draw levels (nx, ny); `colours`: red, green, blue and opacity (to 255) of each level.
-  draw({ context, camera, floor }, { corner, step, shape }, levels, colours) {
+  // Return the colour of each level.
+  get colours() {
+    const themes = this.names.map(themed);
+    if (this.themes !== themes.join()) {
+      const given = themes.map((theme) => theme.split(',').map(Number));
+      this.shades = Array.from({ length: this.most + 1 }, (_, level) => this.shade(level / this.most, ...given).map(Math.round));
+      this.themes = themes.join();
+    }
+    return this.shades;
+  }
+
+  // Draw levels (nx, ny), up to `most`.
+  draw({ context, camera, floor }, { corner, step, shape }, levels) {
     const [nx, ny] = shape;
+    const { colours } = this;
     const [left, low] = [0, 1].map((axis) => corner[axis] - step[axis] / 2);
     if (camera.spatial) {
       const paths = [];
@@ -32,8 +47,8 @@ export class FloorGrid {
       });
       return;
     }
-    if (this.levels !== levels || this.colours !== colours) {
-      Object.assign(this, { levels, colours });
+    if (this.levels !== levels || this.drawn !== colours) {
+      Object.assign(this, { levels, drawn: colours });
       [this.canvas.width, this.canvas.height] = [nx, ny];
       const pixels = new ImageData(nx, ny);
       for (let i = 0; i < nx; i += 1) {

@@ -190,8 +190,7 @@ class Page {
       Home: () => this.seek(0),
       End: () => this.seek(this.log.duration),
       Escape: () => {
-        const tool = [this.reports, this.drawing].find(({ kind }) => kind);
-        if (tool) tool.start(null);
+        if (this.tool) this.tool.start(null);
         else this.select(null);
       },
     };
@@ -243,10 +242,14 @@ class Page {
     }, { passive: false });
   }
 
+  // What clicks on the map draw, if anything.
+  get tool() {
+    return [this.reports, this.drawing].find(({ kind }) => kind);
+  }
+
   choose(x, y) {
-    const tool = [this.reports, this.drawing].find(({ kind }) => kind);
-    if (tool) {
-      tool.click(x, y);
+    if (this.tool) {
+      this.tool.click(x, y);
       return;
     }
     const hit = this.map.hit(x, y);

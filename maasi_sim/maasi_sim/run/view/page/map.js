@@ -1,13 +1,13 @@
 // Draws the map at a time.
 
 import { Belief } from './belief.js';
-import { FOUND, KEEP_OUT, POTENTIAL, SEEN, robotColour, scaleColour, themed } from './colours.js';
+import { FOUND, KEEP_OUT, POTENTIAL, SEEN, objectiveColours, robotColour, themed } from './colours.js';
 import { Labels } from './labels.js';
 import { Background, drawNorth, drawScale } from './map_frame.js';
 import { drawRobot, drawWays } from './robots.js';
 import { LEFT } from './run_log.js';
 import { drawReports } from './statements.js';
-import { circle, cross, dropLine, ellipse, matrix, path, trace } from './shapes.js';
+import { circle, corners, cross, dropLine, edges, ellipse, matrix, path, trace } from './shapes.js';
 import { number } from './text.js';
 import { Unexplored } from './unexplored.js';
 import { drawBuildings } from './buildings.js';
@@ -79,11 +79,10 @@ export class MapView {
   drawGround(log) {
     const { context, camera } = this;
     const [[left, right], [low, high]] = log.bounds;
-    const corners = [[left, low], [right, low], [right, high], [left, high]];
     context.fillStyle = themed('--floor');
     context.strokeStyle = themed('--line');
     context.lineWidth = 1;
-    path(context, camera, corners.map(([x, y]) => [x, y, this.floor]), true);
+    path(context, camera, corners(log.bounds, this.floor), true);
     context.fill();
     context.stroke();
     if (this.layers.background) this.background.draw(this, log.scene);
@@ -98,15 +97,7 @@ export class MapView {
       context.stroke();
     }
     context.globalAlpha = 1;
-    if (log.isSpatial && camera.spatial) {
-      const top = log.bounds[2][1];
-      for (const [x, y] of corners) {
-        path(context, camera, [[x, y, this.floor], [x, y, top]]);
-        context.stroke();
-      }
-      path(context, camera, corners.map(([x, y]) => [x, y, top]), true);
-      context.stroke();
-    }
+    if (log.isSpatial && camera.spatial) edges(context, camera, log.bounds, log.bounds[2]);
     this.gridStep = step;
   }
 
@@ -176,17 +167,7 @@ export class MapView {
       const { fence } = log.scene.robots[name] || {};
       if (!fence) continue;
       context.strokeStyle = robotColour(this.names, name);
-      const [[left, right], [low, high], heights] = fence;
-      const corners = [[left, low], [right, low], [right, high], [left, high]];
-      for (const z of camera.spatial ? heights : [this.floor]) {
-        path(context, camera, corners.map(([x, y]) => [x, y, z]), true);
-        context.stroke();
-      }
-      if (!camera.spatial) continue;
-      for (const [x, y] of corners) {
-        path(context, camera, heights.map((z) => [x, y, z]));
-        context.stroke();
-      }
+      edges(context, camera, fence, camera.spatial ? fence[2] : [this.floor]);
     }
     context.setLineDash([]);
     context.globalAlpha = 1;
@@ -300,15 +281,14 @@ export class MapView {
     if (!decision || !decision.robot || (state && state[5] === LEFT)) return;
     const { context, camera } = this;
     const [, , chosen, , candidates] = decision.robot;
-    const values = candidates.map((item) => item[6]).filter((value) => value !== null);
-    const [low, high] = [Math.min(...values), Math.max(...values)];
+    const colours = objectiveColours(candidates);
     candidates.forEach((item, index) => {
       const [x, y] = camera.project(item);
       const size = index === chosen ? 8 : 5.5;
       context.beginPath();
       context.arc(x, y, size, 0, 2 * Math.PI);
-      if (item[6] !== null) {
-        context.fillStyle = scaleColour(high > low ? (item[6] - low) / (high - low) : 1);
+      if (colours[index]) {
+        context.fillStyle = colours[index];
         context.fill();
       }
       context.lineWidth = index === chosen || index === this.marked ? 3 : 1;

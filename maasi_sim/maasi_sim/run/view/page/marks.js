@@ -1,19 +1,17 @@
 // Marks above the time line: finds, and robots that left or failed.
 
 import { FOUND, themed } from './colours.js';
+import { prepared } from './shapes.js';
 
 // Offset of the input's track from the centre of its knob at the left [px].
 export const KNOB = 8;
 
 export function drawMarks(canvas, log) {
-  const ratio = window.devicePixelRatio || 1;
   const [width, height] = [canvas.clientWidth, canvas.clientHeight];
-  const key = [width, ratio, log.scene.name, log.size, document.documentElement.dataset.theme].join(' ');
+  const key = [width, window.devicePixelRatio, log.scene.name, log.size, document.documentElement.dataset.theme].join(' ');
   if (canvas.dataset.key === key) return;
   canvas.dataset.key = key;
-  [canvas.width, canvas.height] = [width * ratio, height * ratio];
-  const context = canvas.getContext('2d');
-  context.setTransform(ratio, 0, 0, ratio, 0, 0);
+  const context = prepared(canvas, width, height);
   for (const [time, , , level, , text] of log.lines.events) {
     const x = KNOB + ((width - 2 * KNOB) * time) / (log.duration || 1);
     if (level === 'found') {

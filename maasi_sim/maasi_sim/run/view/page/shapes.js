@@ -15,6 +15,32 @@ export function trace(context, camera, points) {
   });
 }
 
+// Return the corners of a rectangle at a height.
+export function corners([[left, right], [low, high]], z) {
+  return [[left, low, z], [right, low, z], [right, high, z], [left, high, z]];
+}
+
+// Draw an upright box as lines: a rectangle at each height, and what joins them.
+export function edges(context, camera, sides, heights) {
+  for (const z of heights) {
+    path(context, camera, corners(sides, z), true);
+    context.stroke();
+  }
+  for (const [x, y] of heights.length > 1 ? corners(sides) : []) {
+    path(context, camera, heights.map((z) => [x, y, z]));
+    context.stroke();
+  }
+}
+
+// Return the context of a canvas, emptied and sized for sharp lines, in pixels of the page.
+export function prepared(canvas, width, height) {
+  const ratio = window.devicePixelRatio || 1;
+  [canvas.width, canvas.height] = [width * ratio, height * ratio];
+  const context = canvas.getContext('2d');
+  context.setTransform(ratio, 0, 0, ratio, 0, 0);
+  return context;
+}
+
 // Return the matrix of a covariance given as xx, xy, xz, yy, yz, zz.
 export function matrix([xx, xy, xz, yy, yz, zz]) {
   return [[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]];

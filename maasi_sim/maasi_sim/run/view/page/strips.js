@@ -3,6 +3,7 @@
 import { robotColour, SEEN, themed } from './colours.js';
 import { KNOB } from './marks.js';
 import { isAway, ENDED, LEFT, MOVING, SILENT } from './run_log.js';
+import { prepared } from './shapes.js';
 import { counted, element } from './text.js';
 import { stateOf } from './words.js';
 
@@ -42,11 +43,8 @@ function summary(stretches, measured) {
 }
 
 function drawStrip(canvas, log, names, name, height) {
-  const ratio = window.devicePixelRatio || 1;
   const width = canvas.clientWidth;
-  [canvas.width, canvas.height] = [width * ratio, height * ratio];
-  const context = canvas.getContext('2d');
-  context.setTransform(ratio, 0, 0, ratio, 0, 0);
+  const context = prepared(canvas, width, height);
   const x = (time) => KNOB + ((width - 2 * KNOB) * time) / (log.duration || 1);
   const [stretches, measured] = historyOf(log, name);
   for (const [kind, from, to] of stretches) {

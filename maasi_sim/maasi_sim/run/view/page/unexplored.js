@@ -78,8 +78,8 @@ function wipe({ corner, step, shape, values }, { view, place }) {
 
 export class Unexplored {
   constructor() {
-    this.floor = new FloorGrid();
-    this.leftFloor = new FloorGrid();
+    this.floor = new FloorGrid(DARKEST, ['--unseen'], (share, colour) => [...colour, DARKEST * share]);
+    this.leftFloor = new FloorGrid(LEFT_SHADES, ['--left'], (share, colour) => [...colour, DARKEST_LEFT * share]);
     // Corner and spacing [m], number of cells on each axis, and e at the shown time.
     this.cells = null;
   }
@@ -92,7 +92,10 @@ export class Unexplored {
     const [since, , , corner, step, shape, digits] = event;
     if (this.digits !== digits || this.scene !== log.scene) {
       const published = Float32Array.from(digits, shareOf);
-      Object.assign(this, { digits, scene: log.scene, open: Uint8Array.from(published, (share) => !Number.isNaN(share)) });
+      const [nx, ny, nz] = shape;
+      // Of open cells; those along the bounds are half as wide.
+      const weight = (share, index) => !Number.isNaN(share) * (Math.floor(index / (ny * nz)) % (nx - 1) ? 1 : 0.5) * ((Math.floor(index / nz) % ny) % (ny - 1) ? 1 : 0.5);
+      Object.assign(this, { digits, scene: log.scene, weights: Float32Array.from(published, weight) });
       this.published = published.map((share) => share || 0);
       this.expect(log.scene, corner, step, shape);
     }
@@ -108,7 +111,8 @@ export class Unexplored {
     let whole = 0;
     for (let i = 0; i < nx; i += 1) {
       for (let j = 0; j < ny; j += 1) {
-        if (!this.open[(i * ny + j) * nz]) continue;
+        const weight = this.weights[(i * ny + j) * nz];
+        if (!weight) continue;
         let likely = 1;
         if (prior) {
           const [low, width, size, values] = prior;
@@ -116,7 +120,7 @@ export class Unexplored {
           likely = values[a * size[1] + b];
         }
         this.before[i * ny + j] = likely;
-        whole += likely * (i % (nx - 1) ? 1 : 0.5) * (j % (ny - 1) ? 1 : 0.5);
+        whole += likely * weight;
       }
     }
     const scale = (targets || 1) / (whole * step[0] * step[1] || 1);
@@ -135,25 +139,15 @@ export class Unexplored {
   // Return the explored share of the open ground.
   get searched() {
     if (!this.cells) return undefined;
-    const { shape: [nx, ny, nz], values } = this.cells;
-    let [sum, whole] = [0, 0];
-    for (let index = 0; index < values.length; index += 1) {
-      const [i, j] = [Math.floor(index / (ny * nz)), Math.floor(index / nz) % ny];
-      const weight = this.open[index] * (i % (nx - 1) ? 1 : 0.5) * (j % (ny - 1) ? 1 : 0.5);
-      sum += weight * (1 - values[index]);
-      whole += weight;
-    }
-    return whole ? sum / whole : undefined;
+    const { values } = this.cells;
+    const whole = this.weights.reduce((sum, weight) => sum + weight, 0);
+    return whole ? this.weights.reduce((sum, weight, index) => sum + weight * (1 - values[index]), 0) / whole : undefined;
   }
 
   // Return the searchable ground [m^2].
   get ground() {
-    const { shape: [nx, ny, nz], step } = this.cells;
-    let whole = 0;
-    for (let index = 0; index < nx * ny; index += 1) {
-      whole += this.open[index * nz] * (Math.floor(index / ny) % (nx - 1) ? 1 : 0.5) * ((index % ny) % (ny - 1) ? 1 : 0.5);
-    }
-    return whole * step[0] * step[1];
+    const { shape: [, , nz], step } = this.cells;
+    return this.weights.reduce((sum, weight, index) => (index % nz ? sum : sum + weight), 0) * step[0] * step[1];
   }
 
   // Return the mean e of a column.
@@ -168,25 +162,18 @@ export class Unexplored {
   drawLeft(view) {
     if (!this.cells || !this.most) return;
     const { shape: [, ny], values } = this.cells;
-    const key = themed('--left');
-    if (this.leftKey !== key) {
-      const colour = key.split(',').map(Number);
-      this.leftColours = Array.from({ length: LEFT_SHADES + 1 }, (_, level) => [...colour, Math.round((DARKEST_LEFT * level) / LEFT_SHADES)]);
-      this.leftKey = key;
-    }
     if (this.leftOf !== values) {
       this.leftOf = values;
       this.leftLevels = Uint8Array.from(this.before, (before, index) => Math.round(LEFT_SHADES * Math.sqrt((before * this.mean(Math.floor(index / ny), index % ny)) / this.most)));
     }
-    this.leftFloor.draw(view, this.cells, this.leftLevels, this.leftColours);
+    this.leftFloor.draw(view, this.cells, this.leftLevels);
   }
 
   draw(view) {
     if (!this.cells) return;
-    const colour = themed('--unseen');
     if (this.isSpace(view.camera)) {
       const { context } = view;
-      context.fillStyle = `rgb(${colour})`;
+      context.fillStyle = `rgb(${themed('--unseen')})`;
       this.each((place, share) => {
         const [x, y] = view.camera.project(place);
         context.globalAlpha = 0.81 * share;
@@ -197,15 +184,11 @@ export class Unexplored {
     }
     // From above a 3D search shows the mean of each column.
     const { shape: [nx, ny], values } = this.cells;
-    if (this.colour !== colour) {
-      const colours = Array.from({ length: DARKEST + 1 }, (_, level) => [...colour.split(',').map(Number), level]);
-      Object.assign(this, { colour, colours });
-    }
     if (this.drawn !== values) {
       this.drawn = values;
       this.levels = Uint8Array.from({ length: nx * ny }, (_, index) => Math.round(DARKEST * this.mean(Math.floor(index / ny), index % ny)));
     }
-    this.floor.draw(view, this.cells, this.levels, this.colours);
+    this.floor.draw(view, this.cells, this.levels);
   }
 
   isSpace(camera) {
@@ -245,7 +228,7 @@ export class Unexplored {
     const [i, j] = place.map((value, axis) => Math.round((value - corner[axis]) / step[axis]));
     if (!(i >= 0 && j >= 0 && i < shape[0] && j < shape[1])) return null;
     const column = i * shape[1] + j;
-    if (!this.open[column * shape[2]]) return null;
+    if (!this.weights[column * shape[2]]) return null;
     return { place, share: this.mean(i, j), left: this.before[column] * this.mean(i, j) };
   }
 }

@@ -1,6 +1,6 @@
 // The panel that explains the waypoint of a robot.
 
-import { scaleColour } from './colours.js';
+import { objectiveColours } from './colours.js';
 import { icon } from './icons.js';
 import { LEFT } from './run_log.js';
 import { counted, element, number, pressable } from './text.js';
@@ -143,8 +143,7 @@ function showCandidates(parent, log, decision, marked, onMark, isOpen) {
     });
     head.append(cell);
   }
-  const values = candidates.map((item) => item[6]).filter((value) => value !== null);
-  const [low, high] = [Math.min(...values), Math.max(...values)];
+  const colours = objectiveColours(candidates);
   const rows = candidates.map((item, row) => [row, item]);
   rows.sort((a, b) => (b[1][order] ?? -Infinity) - (a[1][order] ?? -Infinity));
   const body = table.createTBody();
@@ -154,7 +153,7 @@ function showCandidates(parent, log, decision, marked, onMark, isOpen) {
     pressable(line, () => onMark(row));
     const first = element('td', '');
     const swatch = element('span', 'swatch');
-    if (item[6] !== null) swatch.style.background = scaleColour(high > low ? (item[6] - low) / (high - low) : 1);
+    if (colours[row]) swatch.style.background = colours[row];
     first.append(swatch, String(row));
     line.append(first);
     for (const [, column] of columns) line.append(element('td', '', item[column] === null ? 'not allowed' : number(item[column], true)));
