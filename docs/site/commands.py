@@ -66,6 +66,7 @@ PARSERS = [
     'maasi_drivers.team_command',
     'maasi_drivers.calibrate_sensor',
     'maasi_drivers.measure_mambo',
+    'maasi_drivers.measurement_feed_sender',
     'maasi_sim.experiments.compare',
     'maasi_sim.experiments.reproduce',
     'maasi_sim.experiments.judge',

@@ -15,7 +15,7 @@ from pathlib import Path
 
 from page_tables import code, table
 
-from maasi_filter.ros.parameters import parameters_of
+from maasi_filter.ros.parameters import parameters_of, written
 
 ROOT = Path(__file__).resolve().parents[2]
 DOCS = ROOT / 'docs'
@@ -187,7 +187,7 @@ def parameters_page() -> str:
             (
                 code(item.name),
                 item.constraints,
-                '' if item.default is None else code(item.default),
+                '' if item.default is None else code(written(item.default)),
                 item.info.description,
             )
             for item in parameters_of(node)

@@ -17,7 +17,7 @@ from pydantic_core import PydanticUndefined
 from shapely.geometry.base import BaseGeometry
 
 from maasi_filter.plugins import ChosenSettings
-from maasi_filter.ros.parameters import ParameterField
+from maasi_filter.ros.parameters import ParameterField, written
 from maasi_sim.run.buildings.scenario import CuboidScenario
 from maasi_sim.scenario.schema import Scenario
 
@@ -167,7 +167,7 @@ def _default(info: FieldInfo) -> str:
     value = info.get_default(call_default_factory=True)
     if value is PydanticUndefined or isinstance(value, BaseModel):
         return ''
-    return '*none*' if value is None else code(value)
+    return '*none*' if value is None else code(written(value))
 
 
 def _unit(description: str) -> tuple[str, str]:

@@ -32,7 +32,7 @@ def build_parser() -> argparse.ArgumentParser:
         'are processed as in the driver.',
     )
     add = parser.add_argument
-    add('bag', type=Path, help='folder of the recording')
+    add('bag', type=Path, metavar='BAG', help='folder of the recording')
     add(
         '--parameters',
         type=Path,

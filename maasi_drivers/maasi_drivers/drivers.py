@@ -41,49 +41,79 @@ def _links(driver: str) -> dict[str, MakeLink]:
 
 
 class MamboDriver(AgentDriver):
-    """A quadrotor with a camera that looks down; see `MamboRobotLink` and `CameraInput`."""
+    """Fly a Parrot Mambo, or a quadrotor on ROS topics, with a camera that looks down.
+
+    Services
+    --------
+    `arm` (std_srvs/Trigger), with links mambo_wifi and mambo_ble: permits one take-off
+    """
 
     def __init__(self, **options: Any) -> None:
         super().__init__(_links('mambo_driver'), CameraInput, **options)
 
 
 class MamboOnboardDriver(AgentDriver):
-    """A drone with its own program; see `OnboardLink` and docs/measurement_feed.md."""
+    """Send waypoints to a drone whose own program flies it (docs/measurement_feed.md).
+
+    Services
+    --------
+    `arm` (std_srvs/Trigger): permits one take-off
+    """
 
     def __init__(self, **options: Any) -> None:
         super().__init__(_links('mambo_onboard_driver'), CameraInput, **options)
 
 
 class MavlinkDriver(AgentDriver):
-    """A vehicle with a ranging sensor; see `MavlinkRobotLink` and `RangingInput`."""
+    """Drive a vehicle under ArduPilot or PX4 that has a ranging sensor.
+
+    Services
+    --------
+    `arm` (std_srvs/Trigger), with link mavlink: permits one take-off
+    """
 
     def __init__(self, **options: Any) -> None:
         super().__init__(_links('mavlink_driver'), RangingInput, **options)
 
 
 class MavlinkCameraDriver(AgentDriver):
-    """A vehicle with a camera; see `MavlinkRobotLink` and `CameraInput`."""
+    """Drive a vehicle under ArduPilot or PX4 that has a camera.
+
+    Services
+    --------
+    `arm` (std_srvs/Trigger), with link mavlink: permits one take-off
+    """
 
     def __init__(self, **options: Any) -> None:
         super().__init__(_links('mavlink_camera_driver'), CameraInput, **options)
 
 
 class CameraDriver(AgentDriver):
-    """A robot with a camera; see `TopicLink`, `PlatformLink` and `CameraInput`."""
+    """Drive a robot with a camera, over ROS topics, Crazyswarm2 or Aerostack2.
+
+    Services
+    --------
+    `arm` (std_srvs/Trigger), with links crazyswarm2 and aerostack2: permits one take-off
+    """
 
     def __init__(self, **options: Any) -> None:
         super().__init__(_links('camera_driver'), CameraInput, **options)
 
 
 class RangingDriver(AgentDriver):
-    """A robot with a ranging sensor; see `TopicLink`, `PlatformLink` and `RangingInput`."""
+    """Drive a robot with a ranging sensor, over ROS topics, Crazyswarm2 or Aerostack2.
+
+    Services
+    --------
+    `arm` (std_srvs/Trigger), with links crazyswarm2 and aerostack2: permits one take-off
+    """
 
     def __init__(self, **options: Any) -> None:
         super().__init__(_links('ranging_driver'), RangingInput, **options)
 
 
 class TurtlebotDriver(AgentDriver):
-    """A ground robot with a camera; see `TurtlebotLink`, `Nav2Link` and `CameraInput`."""
+    """Drive a ground robot with a camera, by velocity commands or by Nav2."""
 
     def __init__(self, **options: Any) -> None:
         def link(driver: RobotNode) -> RobotLink:

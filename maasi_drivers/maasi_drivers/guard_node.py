@@ -22,9 +22,9 @@ _REFRESH_PERIOD = 0.5
 
 
 class GuardNode(LockstepLifecycleNode[GuardSettings]):
-    """Publishes zero velocities while the driver is not alive.
+    """Publish zero velocities while the driver of this robot does not respond.
 
-    Robots commanded by a topic need it, as they keep executing the last command. Where Nav2
+    Robots commanded by a topic need it, because they keep executing the last command. Where Nav2
     drives, the guard also cancels its goals.
 
     Subscribes

@@ -65,7 +65,7 @@ class MeasuringFlight:
         self.number = legs
         self.clock = clock
         self.legs: list[Leg] = []
-        # : Duration of one tilt [s].
+        #: Duration of one tilt [s].
         self.time = math.sqrt(length / (9.81 * math.tan(link.tilt)))
         self._event: PositionEvent | None = None
 

@@ -23,10 +23,11 @@ def build_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog='measurement_feed_sender',
         description='Segment camera images and send the blobs to a driver with image_source: feed. '
-        'Ends with the video or by Ctrl-C.',
+        'It ends with the video, or by Ctrl-C.',
     )
     add = parser.add_argument
-    add('video', help='address (rtsp://...), device (/dev/video0) or file that OpenCV can open')
+    sources = 'address (rtsp://...), device (/dev/video0) or file that OpenCV can open'
+    add('video', metavar='VIDEO', help=sources)
     add('to', metavar='HOST:PORT', help='address of the driver')
     add('--rule', default='robust', help='segmentation rule: robust or paper (default: robust)')
     add(

@@ -67,22 +67,22 @@ def build_parser() -> argparse.ArgumentParser:
     common.add_argument('--timeout', type=float, default=10.0, metavar='S', help=text)
     words = parser.add_subparsers(dest='command', required=True, metavar='COMMAND')
     for word in (*COMMANDS, *_OF_DRIVERS):
-        calls = words.add_parser(word, parents=[common], help=_HELP[word])
+        calls = words.add_parser(word, parents=[common], help=_HELP[word], description=_about(word))
         calls.add_argument(
             'robots', nargs='*', metavar='ROBOT', help='robots (default: the whole team)'
         )
     for word in ('state', 'go'):
-        one = words.add_parser(word, parents=[common], help=_HELP[word])
-        one.add_argument('robot', metavar='ROBOT')
+        one = words.add_parser(word, parents=[common], help=_HELP[word], description=_about(word))
+        one.add_argument('robot', metavar='ROBOT', help='name of the robot')
     for axis in 'XY':
-        one.add_argument(axis, type=_metres, help='coordinate in the map frame [m]')
-    one.add_argument(
-        'Z',
-        type=_metres,
-        nargs='?',
-        help='height in the map frame [m] (default: the current height)',
-    )
+        one.add_argument(axis, type=_metres, help=f'{axis.lower()} of the waypoint [m, map]')
+    height = 'height of the waypoint [m, map] (default: the current height)'
+    one.add_argument('Z', type=_metres, nargs='?', help=height)
     return parser
+
+
+def _about(word: str) -> str:
+    return f'{_HELP[word][0].upper()}{_HELP[word][1:]}.'
 
 
 def _metres(text: str) -> float:

@@ -20,10 +20,10 @@ def show(row):
 
 def main():
     parser = argparse.ArgumentParser(prog='bench', description=__doc__)
-    areas = f'{", ".join(AREAS)}; all if none'
+    areas = f'what to measure: {", ".join(AREAS)} (default: all)'
     parser.add_argument('areas', nargs='*', choices=AREAS, metavar='AREA', help=areas)
-    parser.add_argument('--json', type=Path, metavar='FILE', help='write the results there as well')
-    quick = 'a tenth of the calls: shows that all works and roughly how fast'
+    parser.add_argument('--json', type=Path, metavar='FILE', help='write the results to FILE, too')
+    quick = 'measure a tenth of the calls, with rough times'
     parser.add_argument('--quick', action='store_true', help=quick)
     options = parser.parse_args()
     file = options.json

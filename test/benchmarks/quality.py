@@ -1,8 +1,8 @@
-"""Quality of the two filters in whole searches, side by side: `./scripts/quality`.
+"""Compare the two filters in complete searches, and print a table.
 
-Runs the scenario once for each seed, condition and method, and prints a table. Seeds and conditions
-are in `quality_conditions.py`; numbers for documents are from the block `report`, which nothing is
-tuned on.
+Runs one search for each seed, condition and filter. Seeds and conditions are in
+`test/benchmarks/quality_conditions.py`. Documents show the seeds of `report`, on which nothing is
+tuned.
 """
 
 import argparse
@@ -127,20 +127,27 @@ def main():
         prog='quality',
         description=__doc__,
         epilog='`quality reference [NAME ...]` compares both filters with an exact one on small '
-        'scenes, `quality reflections [NAME ...]` counts what is left and false among reflections.',
+        'scenes; `quality reflections [NAME ...]` counts missed targets, and reflections that were '
+        'taken for targets.',
     )
-    parser.add_argument('--filter', nargs='*', choices=METHODS, default=METHODS)
+    parser.add_argument(
+        '--filter',
+        nargs='*',
+        choices=METHODS,
+        default=METHODS,
+        help='filters to compare (default: both)',
+    )
     parser.add_argument(
         '--json',
         type=Path,
         metavar='FILE',
-        help='add each run there as a line; those that are there are not run again',
+        help='add each run to FILE as a line, and skip the runs that FILE has',
     )
     parser.add_argument(
-        '--settings', type=json.loads, metavar='JSON', help='settings of the filter, in all runs'
+        '--settings', type=json.loads, metavar='JSON', help='use these settings of the filter'
     )
     parser.add_argument(
-        '--stone-soup', action='store_true', help="GOSPA next to Stone Soup's JPDA tracker instead"
+        '--stone-soup', action='store_true', help="compare pmb with Stone Soup's JPDA tracker"
     )
     other = OTHERS.get(sys.argv[1]) if len(sys.argv) > 1 else None
     if other is not None:

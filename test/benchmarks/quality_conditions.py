@@ -1,6 +1,7 @@
 """Conditions under which filters are compared, and the seeds for it."""
 
 import math
+import os
 
 import numpy as np
 
@@ -191,11 +192,16 @@ SCENARIOS = {
 
 def wanted(parser, known, runs, jobs):
     """Parse the command line with what is common; return options, names and seeds."""
-    parser.add_argument('names', nargs='*', help='names, or parts of names; none: all')
-    parser.add_argument('--seeds', choices=sorted(SEEDS), default='development')
-    parser.add_argument('--runs', type=int, default=runs, metavar='N', help='first N of the block')
-    parser.add_argument('--jobs', type=int, default=jobs, metavar='N', help='processes')
+    what = 'conditions by name or part of a name (default: all)'
+    parser.add_argument('names', nargs='*', metavar='NAME', help=what)
+    seeds = 'block of seeds (default: %(default)s)'
+    parser.add_argument('--seeds', choices=sorted(SEEDS), default='development', help=seeds)
+    first = 'use the first N seeds of the block (default: %(default)s)'
+    parser.add_argument('--runs', type=int, default=runs, metavar='N', help=first)
+    parallel = f'run N processes (default: {jobs or "one per core"})'
+    parser.add_argument('--jobs', type=int, default=jobs, metavar='N', help=parallel)
     options = parser.parse_args()
+    options.jobs = options.jobs or os.cpu_count() or 1
     parts = [part for part in options.names if part not in known]
     names = [n for n in known if n in options.names or any(part in n for part in parts)]
     if options.names and not names:

@@ -1,15 +1,14 @@
-"""Quality of whole searches with each planner, side by side: `./scripts/search_quality`.
+"""Compare the planners in complete searches, and print tables in Markdown.
 
-Compares planners in regimes and prints tables in Markdown. Seeds are those of
-`quality_conditions.py`: numbers for documents are from the block `report`, which nothing is tuned
-on.
+Conditions are in `test/benchmarks/search_quality.py`, seeds in
+`test/benchmarks/quality_conditions.py`. Documents show the seeds of `report`, on which nothing is
+tuned. Run the same command again to resume.
 """
 
 import argparse
 import dataclasses
 import itertools
 import math
-import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -289,16 +288,19 @@ MEANS = {'time': 'Time to find all', 'mean_time': 'Mean time to find a target'}
 
 def main():
     parser = argparse.ArgumentParser(prog='search_quality', description=__doc__)
-    parser.add_argument('--planner', nargs='*', choices=tuple(KINDS), default=list(KINDS))
+    kinds = f'planners to compare: {", ".join(KINDS)} (default: all)'
+    parser.add_argument(
+        '--planner', nargs='*', choices=KINDS, default=list(KINDS), metavar='NAME', help=kinds
+    )
     folder = Path('runs/search_quality')
-    kept = 'folder of the runs; those there are kept'
+    kept = 'folder of the runs; runs in it are not repeated (default: %(default)s)'
     parser.add_argument('--out', type=Path, default=folder, metavar='DIR', help=kept)
-    parser.add_argument('--document', type=Path, metavar='FILE', help='write the tables into it')
-    brief = 'one table: seconds until half, 90 %% and all are found'
+    parser.add_argument('--document', type=Path, metavar='FILE', help='update the tables in FILE')
+    brief = 'print one table: times [s] until half, 90 %% and all targets are found'
     parser.add_argument('--short', action='store_true', help=brief)
-    why = 'one table: where the time until 90 %% are found goes, instead'
+    why = 'print what the time until 90 %% of the targets are found is spent on'
     parser.add_argument('--explain', action='store_true', help=why)
-    options, regimes, seeds = wanted(parser, REGIMES, runs=16, jobs=os.cpu_count() or 1)
+    options, regimes, seeds = wanted(parser, REGIMES, runs=16, jobs=None)
     if options.explain:
         pairs = itertools.product(regimes, options.planner)
         works = [((regime, kind), prepared(regime, kind)) for regime, kind in pairs]

@@ -38,10 +38,7 @@ MakeSensor = Callable[[RobotNode], SensorInput]
 
 
 class AgentDriver(RobotNode):
-    """The driver of a robot, in the robot's namespace.
-
-    It is composed of a link to the robot, a sensor, and parts with one concern each: `GoalServer`,
-    `MeasurementResponder`, `StatePublisher`, `Watchdog`, `RobotFrames`.
+    """Join a robot to a search; run one driver for each robot, in the robot's namespace.
 
     Subscribes
     ----------
@@ -64,6 +61,11 @@ class AgentDriver(RobotNode):
     Services
     --------
     `stop`, `release` (std_srvs/Trigger): the robot stops, and accepts no goals until `release`
+
+    Notes
+    -----
+    A driver is composed of a link to the robot, a sensor, and parts with one concern each:
+    `GoalServer`, `MeasurementResponder`, `StatePublisher`, `Watchdog`, `RobotFrames`.
 
     Parameters
     ----------

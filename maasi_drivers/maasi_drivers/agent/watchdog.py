@@ -17,7 +17,7 @@ class StatePublisher:
 
     def __init__(self, driver: RobotNode) -> None:
         self._driver = driver
-        # : Battery charge; -1 if unknown.
+        #: Battery charge; -1 if unknown.
         self.charge = -1.0
         self._state = AgentState(robot=driver.robot, battery=-1.0)
         self._state.header.frame_id = driver.settings.frame

@@ -46,7 +46,7 @@ class RecordedRobot:
         remap: Mapping[str, str] | None = None,
     ) -> None:
         self.settings = settings
-        # : Number of unused images or detections, by reason.
+        #: Number of unused images or detections, by reason.
         self.reasons: Counter[str] = Counter()
         self.in_map = False  # whether its odometry is in the map, so that its start is not added
         self._bag, self._remap = bag, remap

@@ -33,7 +33,7 @@ class CommandPublisher:
         self._node = node
         self._quality = RELIABLE if lockstep else COMMANDS
         self.topic = node.resolve_topic_name(topic)
-        # : None until the type is known.
+        #: None until the type is known.
         self.publisher: Any = None
         self._kind: type = TwistStamped
         self._subscribed_at = time.monotonic()

@@ -112,8 +112,8 @@ class VideoSource:
             )
         self.source = source
         self.live = '://' in source or source.startswith('/dev/') or source.isdigit()
-        self.error = ''  # : problem; empty while frames arrive
-        self.ended = False  # : whether a file has ended
+        self.error = ''  #: problem; empty while frames arrive
+        self.ended = False  #: whether a file has ended
         # The newest one until it is read.
         self._frames: deque[VideoFrame] = deque(maxlen=1)
         self._count = 0

@@ -18,10 +18,10 @@ from maasi_drivers.vision.images import ImageSourceError
 
 MAGIC = b'MSMF'
 VERSION = 1
-# : Most blobs per image.
+#: Most blobs per image.
 MOST = 256
 BORDER_CUT = 1
-HAS_POSE = 1  # : flag: the robot's pose follows the header
+HAS_POSE = 1  #: flag: the robot's pose follows the header
 
 _HEADER = struct.Struct('<4sBBHHHII')
 _POSE = struct.Struct('<7fI')

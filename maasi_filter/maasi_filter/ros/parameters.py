@@ -213,22 +213,34 @@ def parameters_of(node: type) -> Iterator[ParameterField]:
     yield from fields.values()
 
 
+# Sections of docstrings that are for programmers.
+_FOR_PROGRAMMERS = ('Parameters', 'Attributes', 'Notes')
+
+
 def node_help(node: type, name: str, base: type) -> str:
     """Return the help of a class of nodes from its docstrings, down to `base`, and settings."""
     text = [
-        f'usage: {name} [--ros-args [--params-file FILE] [-p NAME:=VALUE] [-r __ns:=/TEAM] ...]'
+        f'usage: {name} [--ros-args [--params-file FILE] [-p NAME:=VALUE] '
+        '[-r __ns:=/NAMESPACE] ...]'
     ]
+    sections: dict[str, list[str]] = {}
     for kind in node.__mro__[: node.__mro__.index(base) + 1]:
         doc = inspect.cleandoc(kind.__dict__.get('__doc__') or '')
-        # Without sections for programmers.
-        text.append(re.split(r'\n(?:Parameters|Attributes)\n-+\n', doc)[0].strip())
+        description, *rest = re.split(r'^(\w+)\n-+\n', doc, flags=re.M)
+        found = dict(zip(rest[::2], rest[1::2], strict=True))
+        found = {title: found[title] for title in found if title not in _FOR_PROGRAMMERS}
+        if kind is not base and (kind is node or found):
+            text.append(description.strip())
+        for title, content in found.items():
+            sections.setdefault(title, []).append(content.strip())
+    for title, contents in sections.items():
+        text.append(f'{title}\n{"-" * len(title)}\n' + ';\n'.join(contents))
     text.append('ROS parameters\n--------------')
     for item in parameters_of(node):
-        default = str(item.default).lower() if isinstance(item.default, bool) else item.default
         words = [
             item.info.description,
             item.constraints and f'allowed: {item.constraints}',
-            None if default is None else f'default: {default}',
+            None if item.default is None else f'default: {written(item.default)}',
         ]
         indent = ' ' * 6
         text[-1] += f'\n  {item.name}\n' + textwrap.fill(
@@ -236,3 +248,12 @@ def node_help(node: type, name: str, base: type) -> str:
         )
     text.append('Exit codes: 0 ended, 1 failed, 2 wrong parameters.')
     return '\n\n'.join(filter(None, text))
+
+
+def written(value: Any) -> str:
+    """Return a default for people: numbers of up to six digits, texts and lists as in YAML."""
+    if isinstance(value, list | tuple):
+        return f'[{", ".join(map(written, value))}]'
+    if isinstance(value, bool):
+        return str(value).lower()
+    return f'{value:.6g}' if isinstance(value, float) and value != round(value, 6) else str(value)

@@ -134,7 +134,7 @@ class Updated(Fact):
     expected: float = 0.0
     clusters: Sequence[Cluster] = ()
     duration: float = 0.0  # computation [s]
-    # : True positions of all robots, (3,) [m], in a search in one process.
+    #: True positions of all robots, (3,) [m], in a search in one process.
     positions: Mapping[str, FloatArray] = field(default_factory=dict)
     new: Sequence[FoundTarget] = ()  # newly found, if `found` has its own message
     batch: int = 0

@@ -84,7 +84,7 @@ class RunRecord:
         self._charges: dict[str, list[tuple[float, float]]] = {
             name: [] for name in scenario.names()
         }
-        self.team = set(scenario.names())  # : robots of the team
+        self.team = set(scenario.names())  #: robots of the team
         self._lost: set[str] = set()
 
     def add(self, fact: facts.Fact) -> None:

@@ -66,9 +66,9 @@ class MessageFacts:
         self._levels: dict[str, int] = {}
         # Explored share by team, as last reported by its planner.
         self._shares: dict[str, float] = {}
-        self.dropped = Counter[str]()  # : number of unusable messages by topic
-        self.pictures = Pictures()  # : images without detections yet
-        self.notes: dict[Any, Any] = {}  # : memory of readers of other missions
+        self.dropped = Counter[str]()  #: number of unusable messages by topic
+        self.pictures = Pictures()  #: images without detections yet
+        self.notes: dict[Any, Any] = {}  #: memory of readers of other missions
 
     def of(self, topic: str, kind: str, message: Any) -> Iterator[facts.Fact]:
         """Return the facts of a message of a topic, for which `is_read` is true.

@@ -27,9 +27,9 @@ if TYPE_CHECKING:
 class Observer:
     """Builds the record of a run from serialised messages and detects its end."""
 
-    # : Topics of filter updates, which are added after the messages they refer to.
+    #: Topics of filter updates, which are added after the messages they refer to.
     update_topics: Sequence[str] = ()
-    # : Number of targets; true and false finds; measurements of all robots.
+    #: Number of targets; true and false finds; measurements of all robots.
     total = found = false_found = measurements = 0
     explored = 0.0  #: share of the environment explored
     news = False  # whether targets were found since the caller reset it
@@ -95,7 +95,7 @@ Record = TypeVar('Record', bound=RunRecord, contravariant=True)
 class Mission(Protocol[Record]):
     """A kind of search: scenario, nodes, observer and report."""
 
-    # : Name of the scenario, and the scenario with all layers.
+    #: Name of the scenario, and the scenario with all layers.
     name: str
     scenario: Any
     found_word: str  # past participle for the progress line
@@ -139,5 +139,5 @@ class MissionKind:
     make: Callable[..., Mission[Any]]  # from a name, a scenario layer and overrides
 
 
-# : By planner name; each registers itself in its module `<folder>/<name>_mission.py`.
+#: By planner name; each registers itself in its module `<folder>/<name>_mission.py`.
 MISSIONS: dict[str, MissionKind] = {}

@@ -142,7 +142,7 @@ class NodeProcess(ForkServerProcess):
         self.command, self.log = command, log
         self.restarts = 0
         self.started = 0.0
-        # : Time of the last heartbeat, and the processor waiting time until then.
+        #: Time of the last heartbeat, and the processor waiting time until then.
         self.beaten: float | None = None
         self._waited = 0.0
 
@@ -252,5 +252,5 @@ def stop(processes: Sequence[NodeProcess]) -> list[str]:
 
 if _STARTED_BY in os.environ:
     _load(int(os.environ.pop(_STARTED_BY)))
-# : Parent process of a node: it was forked from the process that loaded this module first.
+#: Parent process of a node: it was forked from the process that loaded this module first.
 _server = os.getpid()

@@ -109,11 +109,11 @@ class Recorder:
         #: Robots at the first step, and time of the first message of each recorded topic [ns].
         self.robots: list[str] = []
         self.first: dict[str, int] = {}
-        self.explored = 0.0  # : explored share, published by planners each second
+        self.explored = 0.0  #: explored share, published by planners each second
         self._faulty: set[str] = (
             set()
         )  # planners whose current error is already among the complaints
-        # : Wall time of the last diagnostics of each node [s].
+        #: Wall time of the last diagnostics of each node [s].
         self.heartbeats: dict[str, float] = {}
         self._arming: dict[str, Client] = {}
         self._armed_at = 0.0

@@ -64,7 +64,7 @@ class Batch:
     detections: list[bytes]
     namespace: str
     late: bool
-    # : Statements of persons that the filter used before it.
+    #: Statements of persons that the filter used before it.
     reports: list[Report] = field(default_factory=list)
 
 
@@ -73,9 +73,9 @@ class Recording:
     """Contents of a recording for a replay."""
 
     facts: dict[str, Any]  #: scenario, seed and parameters of each node
-    # : Batches of all filters, by step and name.
+    #: Batches of all filters, by step and name.
     batches: list[Batch] = field(default_factory=list)
-    # : Found targets at the end, by namespace of the filter.
+    #: Found targets at the end, by namespace of the filter.
     found: dict[str, FoundTargetArray] = field(default_factory=dict)
 
 

@@ -37,7 +37,7 @@ class Supervisor:
             name: plan.process(folder, team, level) for name, plan in self.plans.items()
         }
         self.events: list[dict[str, Any]] = []  #: nodes that died, hung or were restarted
-        # : Whether all nodes have been ready; before that they may take long.
+        #: Whether all nodes have been ready; before that they may take long.
         self.running = False
         self._scenario = mission.scenario
         self._options, self._display = options, display

@@ -83,7 +83,7 @@ class SimulatedRobot:
         self._flies = settings.flies
         self._resting = False
         self._terrain = world.area.terrain
-        # : Wind (3,) [m/s, map], which carries a flying robot.
+        #: Wind (3,) [m/s, map], which carries a flying robot.
         self.wind = np.zeros(3)
         self.battery = Battery(settings.battery)
         self._chargers = _chargers(settings)

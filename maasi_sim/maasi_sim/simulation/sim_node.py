@@ -63,8 +63,7 @@ class SimNodeSettings(NodeSettings):
 
 
 class SimNode(LockstepLifecycleNode[SimNodeSettings]):
-    """
-    Simulates the robots of a scenario, and publishes the time.
+    """Simulate the robots of a scenario and publish the time.
 
     The time starts when the driver of each robot, the filter, the planner and, with parameter
     `recorder`, the recorder have reported that they are ready. In lockstep a step ends when each
@@ -72,8 +71,8 @@ class SimNode(LockstepLifecycleNode[SimNodeSettings]):
     far behind. The step is republished for a restarted node that reports ready, so that a step can
     be received twice.
 
-    Where another program moves a robot, the time is that of the `/clock` that it publishes: the
-    first step is that of the time when all nodes are ready.
+    Where another program moves a robot, the time is that of the `/clock` that it publishes, and
+    the first step is at the time at which all nodes are ready.
 
     Publishes
     ---------
@@ -85,7 +84,7 @@ class SimNode(LockstepLifecycleNode[SimNodeSettings]):
     `/clock` (rosgraph_msgs/Clock), unless another program does, in lockstep four times a second;
     `lockstep/step` (maasi_msgs/LockstepStep), and, latched, `lockstep/robots` where these change;
     `ground_truth/targets` (geometry_msgs/PoseArray), `ground_truth/markers`
-    (visualization_msgs/MarkerArray): latched, only for scoring and for the eye
+    (visualization_msgs/MarkerArray): latched, only for scores and for display
 
     Subscribes
     ----------
@@ -94,8 +93,8 @@ class SimNode(LockstepLifecycleNode[SimNodeSettings]):
     `lockstep/ready`, `lockstep/done` (maasi_msgs/LockstepDone)
     """
 
-    robot_node = 'driver'  # : name of the node that commands each robot
-    # : Reader of the scenario, and constructor of its robots.
+    robot_node = 'driver'  #: name of the node that commands each robot
+    #: Reader of the scenario, and constructor of its robots.
     load: ClassVar[Any] = staticmethod(load_scenario)
     simulate: ClassVar[Any] = Simulation
 

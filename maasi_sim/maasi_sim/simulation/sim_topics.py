@@ -72,7 +72,7 @@ class RobotTopics:
         )
         self._full = 100.0 if robot.battery_unit == 'percent' else 1.0
         self._battery.header.frame_id = f'{name}/base_link'
-        self.needed: list[str] = []  # : full names of the topics that its driver needs
+        self.needed: list[str] = []  #: full names of the topics that its driver needs
         if self._odometry_publisher is not None:
             self.needed.append(self._odometry_publisher.topic_name)
         # Measurements that another program publishes.
@@ -260,7 +260,7 @@ class Connections:
 class ExternalRobot:
     """A robot moved by another program, which measures at its driver's pose."""
 
-    obeys = False  # : the simulation does not wait for it at shutdown
+    obeys = False  #: the simulation does not wait for it at shutdown
 
     def __init__(self, start: Pose) -> None:
         self.state = RobotState(start)  #: in the map

@@ -67,15 +67,15 @@ class MamboLink:
     land_after: float = 3.0  # [s]
 
     def __post_init__(self) -> None:
-        self.error = ''  # : fault of the link, which keeps trying to connect
+        self.error = ''  #: fault of the link, which keeps trying to connect
         self.connected = False  #: whether the drone has answered
-        # : State of the drone, in pyparrot's words: landed, takingoff, hovering, flying, ...
+        #: State of the drone, in pyparrot's words: landed, takingoff, hovering, flying, ...
         self.flying_state = ''
         self.battery = -1.0  #: charge, 0 to 1; negative: not received yet
         #: Time of the last new data or acknowledgement, monotonic clock [s].
         self.received_at = -math.inf
         self.position: PositionEvent | None = None  #: the last position event
-        # : Number of unusable position events.
+        #: Number of unusable position events.
         self.bad_events = 0
         self._drone: Any = None
         self._stamps: dict[str, Any] = {}

@@ -96,7 +96,7 @@ class DeadReckoning:
     def __init__(self, model: TiltModel, origin: Pose, settings: MamboSettings) -> None:
         self.model, self.origin, self.settings = model, origin, settings
         self.course = Course(origin.position, np.zeros(3), origin.yaw)
-        # : Steady acceleration by wind or a tilted level, (2,) [m/s^2, map].
+        #: Steady acceleration by wind or a tilted level, (2,) [m/s^2, map].
         self.push = np.zeros(2)
         #: Time of flight since the last correction [s].
         self.age = 0.0

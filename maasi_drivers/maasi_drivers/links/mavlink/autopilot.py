@@ -66,12 +66,12 @@ class Autopilot:
         self.mode = -1
         self.lost = False
         self.estimate = Estimate(settings, self.flight_origin, self.on_restart)
-        self.commands: deque[_Command] = deque()  # : unanswered commands
-        # : Numbers of the commands accepted in this phase of the flight.
+        self.commands: deque[_Command] = deque()  #: unanswered commands
+        #: Numbers of the commands accepted in this phase of the flight.
         self.accepted: set[int] = set()
         self.fence = FenceUpload(settings, sender, self.log)
         self.setpoints = SetpointCheck()
-        self.breached_at = -math.inf  # : time of its last report of a fence breach
+        self.breached_at = -math.inf  #: time of its last report of a fence breach
         self._sender = sender
         self._received_at = self._heartbeat_at = self._setpoint_at = -math.inf
         self._requested_at = -math.inf  # time of the last request for messages

@@ -52,7 +52,7 @@ class FenceUpload:
     """Uploads the fence of an autopilot and verifies it; times: steady clock."""
 
     def __init__(self, settings: MavlinkSettings, sender: Any, log: ReportLog) -> None:
-        # : Why the autopilot may have another fence; empty if verified or not needed.
+        #: Why the autopilot may have another fence; empty if verified or not needed.
         self.problem = ''
         self._items: list[Item] = []
         self._vehicle = settings.system, mavlink.MAV_COMP_ID_AUTOPILOT1

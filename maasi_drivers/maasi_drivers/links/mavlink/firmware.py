@@ -151,7 +151,7 @@ class FailsafeCheck:
     def __init__(
         self, firmware: Firmware, settings: MavlinkSettings, sender: Any, log: ReportLog
     ) -> None:
-        # : Parameter values; None if the autopilot does not have it.
+        #: Parameter values; None if the autopilot does not have it.
         self.values: dict[str, float | None] = {}
         self.complete = False
         self._firmware, self._settings, self._sender, self._log = firmware, settings, sender, log

@@ -46,7 +46,7 @@ class SetpointCheck:
         """Discard all set-points, after another kind of them."""
         self._sent: deque[tuple[float, FloatArray]] = deque()
         self._since = self._other_since = self._standing_since = math.inf
-        # : Position (3,) that the autopilot has instead; None: unknown, or a velocity.
+        #: Position (3,) that the autopilot has instead; None: unknown, or a velocity.
         self.other: FloatArray | None = None
 
     def note(self, position: FloatArray, now: float) -> None:

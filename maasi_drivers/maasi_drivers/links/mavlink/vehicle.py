@@ -45,12 +45,12 @@ class Vehicle(Autopilot):
         # Target position and yaw; none: it stops, and keeps its yaw.
         self._target: FloatArray | None = None
         self._yaw: float | None = None
-        # : Largest speed [m/s]; none: the autopilot's.
+        #: Largest speed [m/s]; none: the autopilot's.
         self.speed: float | None = None
-        # : Planned deceleration [m/s^2]; none: any.
+        #: Planned deceleration [m/s^2]; none: any.
         self.braking: float | None = None
         self._speed_due = True
-        # : The set-point (3,) that the autopilot has just rejected, or None.
+        #: The set-point (3,) that the autopilot has just rejected, or None.
         self.rejected: FloatArray | None = None
         self._rejected_at = self._released_at = -math.inf
         # Smallest distance to its height so far [m], and its time.

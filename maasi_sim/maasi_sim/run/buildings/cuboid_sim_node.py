@@ -19,18 +19,18 @@ _PATIENCE = 0.1  # share of a step after which the link delivers, even if robots
 
 
 class CuboidSimNode(SimNode):
-    """Simulates the robots of a search of buildings and a radio of limited range.
+    """Simulate the robots of a search of buildings and a radio of limited range.
 
-    Each robot receives one message per step with all that robots in its range have sent: once
-    all present robots have sent, or, without lockstep, soon after the begin of the step.
+    Each robot receives one message per step with all that the robots in its range have sent: once
+    all present robots have sent or, without lockstep, soon after the step begins.
 
     Publishes
     ---------
-    as `SimNode`, and `<robot>/link/rx` (maasi_msgs/SearchLinkArray)
+    `<robot>/link/rx` (maasi_msgs/SearchLinkArray)
 
     Subscribes
     ----------
-    as `SimNode`, and `<robot>/link/tx` (maasi_msgs/SearchLink)
+    `<robot>/link/tx` (maasi_msgs/SearchLink)
     """
 
     robot_node = 'cuboid_planner'

@@ -65,7 +65,7 @@ class Moments:
         #: Last event by kind, then by owner; detections of the last moments.
         self.last: dict[str, dict[str, Event]] = defaultdict(dict)
         self.seen: list[Event] = []
-        # : By robot: path so far, tour, and waypoint (None: it stays).
+        #: By robot: path so far, tour, and waypoint (None: it stays).
         self.paths: dict[str, list[list[float]]] = defaultdict(list)
         self.tours: dict[str, list[list[float]]] = {}
         self.waypoints: dict[str, list[float] | None] = {}

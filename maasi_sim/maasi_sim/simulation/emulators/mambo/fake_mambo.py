@@ -338,22 +338,23 @@ def build_parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
     parser = argparse.ArgumentParser(
         prog='fake_mambo',
-        description='A simulated Parrot Mambo on the network of this host, for a driver with '
-        'link: mambo_wifi, or for any program that uses pyparrot over WiFi.',
+        description='Simulate a Parrot Mambo on the network of this host, for a driver with '
+        'link: mambo_wifi or any other program that uses pyparrot over WiFi. Ctrl-C ends it.',
     )
     settings = FirmwareSettings()
 
     def add(name: str, help: str, **options: Any) -> None:
-        parser.add_argument(f'--{name}', help=help, **options)
+        parser.add_argument(f'--{name}', help=f'{help} (default: %(default)s)', **options)
 
-    add('address', 'of this host (default: %(default)s)', default='127.0.0.1')
-    add('type', 'robot type (default: %(default)s)', default='mambo', metavar='NAME')
-    add('seed', 'of the noise', type=whole, default=1, metavar='N')
-    add('charge', 'of the battery at the start, 0 to 1', type=float, default=1.0, metavar='X')
-    drag, delay = 'of its body [1/s]', 'from a command to its tilt set-point [s]'
-    add('drag', f'{drag} (%(default)s)', type=float, default=settings.drag, metavar='X')
-    add('delay', f'{delay} (%(default)s)', type=float, default=settings.delay, metavar='X')
-    silent = 'behaviour when its controller is silent (%(default)s)'
+    add('address', 'listen on this address', default='127.0.0.1', metavar='ADDRESS')
+    add('type', 'robot type, in config/robots', default='mambo', metavar='NAME')
+    add('seed', 'random seed of the noise', type=whole, default=1, metavar='N')
+    charge = 'charge of the battery at the start, from 0 to 1'
+    add('charge', charge, type=float, default=1.0, metavar='X')
+    add('drag', 'drag of the drone [1/s]', type=float, default=settings.drag, metavar='X')
+    delay = 'delay from a command to its tilt [s]'
+    add('delay', delay, type=float, default=settings.delay, metavar='S')
+    silent = 'what the drone does when its controller is silent'
     add('lost-link', silent, choices=('hover', 'land'), default=settings.lost_link)
     return parser
 

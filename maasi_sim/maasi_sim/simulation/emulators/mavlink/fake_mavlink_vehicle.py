@@ -90,21 +90,24 @@ def build_parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
     parser = argparse.ArgumentParser(
         prog='fake_mavlink_vehicle',
-        description='A fake vehicle that speaks MAVLink 2, to try the driver without a real one.',
+        description='Simulate a vehicle that speaks MAVLink 2, to try the driver without a real '
+        'one. Ctrl-C ends it.',
     )
 
     def add(name: str, help: str, **options: Any) -> None:
         parser.add_argument(f'--{name}', help=help, **options)
 
     url, names = 'udpout:127.0.0.1:14550', sorted(FIRMWARES)
-    add('url', 'of the driver, in the form of pymavlink (default: %(default)s)', default=url)
-    behaviour = 'whose behaviour it has (default: %(default)s)'
+    to = 'connect to the driver at this address of pymavlink (default: %(default)s)'
+    add('url', to, default=url)
+    behaviour = 'behave as this autopilot (default: %(default)s)'
     add('firmware', behaviour, choices=names, default='arducopter')
-    add('system', 'system id (default: 1)', type=int, default=1)
-    ready = 'until its position estimate is ready (default: 2)'
+    add('system', 'MAVLink system id (default: 1)', type=int, default=1, metavar='N')
+    ready = 'time until the position estimate is ready [s] (default: 2)'
     add('estimator-time', ready, type=float, default=2.0, metavar='S')
-    add('charge', 'of its battery, 0 to 1 (default: 1)', type=float, default=1.0)
-    given = 'of the autopilot, as FS_GCS_ENABLE=0; may be given more than once'
+    charge = 'charge of the battery at the start, from 0 to 1 (default: 1)'
+    add('charge', charge, type=float, default=1.0, metavar='X')
+    given = 'set a parameter of the autopilot, for example FS_GCS_ENABLE=0; can be repeated'
     add('parameter', given, action='append', default=[], metavar='NAME=VALUE')
     return parser
 
