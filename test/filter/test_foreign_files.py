@@ -110,15 +110,15 @@ def test_maps_are_read_in_the_modes_of_nav2(tmp_path):
     'facts, words',
     [
         ({'resolution': 0}, 'resolution: read 0, allowed are numbers above 0'),
-        ({'resolution': 'fine'}, 'resolution: read fine, allowed is a number'),
-        ({'mode': 'grey'}, 'mode: read grey, allowed are trinary, scale, raw'),
+        ({'resolution': 'fine'}, "resolution: read 'fine', allowed is a number"),
+        ({'mode': 'grey'}, "mode: read 'grey', allowed are trinary, scale, raw"),
         ({'origin': [1, 2]}, r'origin: read \[1, 2\], allowed is \[x, y, yaw\]'),
-        ({'image': None}, 'image: read None, allowed is the name of a file'),
+        ({'image': None}, 'image: read null, allowed is the name of a file'),
         ({'image': 'gone.pgm'}, r'gone\.pgm: No such file or directory'),
         ({'image': 'room.yaml'}, r'room\.yaml: '),
-        ({'image': ''}, 'image: read , allowed is the name of a file'),
+        ({'image': ''}, "image: read '', allowed is the name of a file"),
         ({'occupied_thresh': 65}, 'occupied_thresh: read 65, allowed are numbers from 0 to 1'),
-        ({'occupied_thresh': None}, 'occupied_thresh: read None, allowed is a number'),
+        ({'occupied_thresh': None}, 'occupied_thresh: read null, allowed is a number'),
     ],
 )
 def test_a_map_that_cannot_be_used_is_refused_by_its_key(tmp_path, facts, words):

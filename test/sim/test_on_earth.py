@@ -86,11 +86,15 @@ def test_points_of_the_area_are_starts_and_chargers(tmp_path):
     ('start', 'words'),
     [
         ({'latitude': 146.6, 'longitude': 9.9}, 'start: latitude: read 146.6, allowed is a number'),
-        ({'latitude': 46.6}, 'start: longitude: read None, allowed is a number from -180 to 180'),
+        (
+            {'latitude': 46.6},
+            'start: longitude: read nothing, allowed is a number from -180 to 180',
+        ),
         ({**HOME, 'z': 3}, 'start: allowed are latitude, longitude, and height above the map'),
         (
             {'latitude': 46.61, 'longitude': 9.9},
-            r'start: read 0 1112 0 m \(46\.610000, 9\.900000\), 1012 m outside of the area; ',
+            r'start: read \(0, 1112, 0\) m, latitude 46\.610000, longitude 9\.900000, 1012 m '
+            r'outside of the area; ',
         ),
         (
             {'latitude': 9.9, 'longitude': 46.6},

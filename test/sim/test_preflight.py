@@ -56,7 +56,7 @@ def test_25_hectares_in_10_minutes_are_too_many():
     assert report.lines[3] == (
         'team: one pass takes 16 min; no charging needed; the time limit is 10 min'
     )
-    assert report.lines[-1] == 'west: starts at 20 20 20 m'
+    assert report.lines[-1] == 'west: starts at (20, 20, 20) m'
     # 2 x 16 m x 8 m/s x 600 s of 250,000 m2.
     assert len(report.warnings) == 1 and report.warnings[0].startswith(
         'limits.time: one pass of the team takes 16 min without turns; in 10 min about 61 % of'
@@ -69,7 +69,7 @@ def test_25_hectares_in_10_minutes_are_too_many():
     # A flight of 15 minutes, then 21 minutes at the charger.
     assert report.warnings == []
     assert report.lines[3].startswith('team: one pass takes 37 min; charges: east 1, west 1; the')
-    assert report.lines[-1] == 'west: starts at 20 20 20 m, its charger'
+    assert report.lines[-1] == 'west: starts at (20, 20, 20) m, its charger'
 
 
 def test_robots_that_cannot_be_charged_have_one_flight():
@@ -208,7 +208,7 @@ def test_the_command_prints_what_a_search_takes_and_starts_nothing(tmp_path, cap
     wrong['robots']['east']['start'] = [505.0, 20.0, 20.0]
     (tmp_path / 'field.yaml').write_text(yaml.safe_dump(wrong))
     assert run_scenario.main(['--check', 'field.yaml']) == 2
-    assert 'robots.east.start: read 505 20 20 m' in capsys.readouterr().err
+    assert 'robots.east.start: read (505, 20, 20) m' in capsys.readouterr().err
     assert [path.name for path in tmp_path.iterdir()] == ['field.yaml']
 
 

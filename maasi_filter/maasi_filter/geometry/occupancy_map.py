@@ -14,6 +14,7 @@ import shapely.affinity
 from shapely.geometry.base import BaseGeometry
 
 from maasi_filter.arrays import BoolArray, FloatArray
+from maasi_filter.wording import shown
 
 _MOST_PIXELS = 25_000_000  # of maps and rasters, as 5000 x 5000: 200 MB as numbers
 _MODES = ('trinary', 'scale', 'raw')
@@ -103,7 +104,7 @@ def read_map(path: str) -> BaseGeometry:
             raise ValueError(f'resolution: read {cell:g}, allowed are numbers above 0')
         origin = facts.get('origin')
         if not isinstance(origin, list) or len(origin) != 3:
-            raise ValueError(f'origin: read {origin}, allowed is [x, y, yaw]')
+            raise ValueError(f'origin: read {shown(origin)}, allowed is [x, y, yaw]')
         west, south, yaw = (_number({'origin': value}, 'origin') for value in origin)
         occupied = _occupied(facts, Path(path).parent)
     except ValueError as error:
@@ -122,7 +123,7 @@ def _number(facts: Mapping[str, Any], key: str) -> float:
     except (TypeError, ValueError):
         number = math.nan
     if not math.isfinite(number):
-        raise ValueError(f'{key}: read {facts[key]}, allowed is a number')
+        raise ValueError(f'{key}: read {shown(facts[key])}, allowed is a number')
     return number
 
 
@@ -130,9 +131,9 @@ def _occupied(facts: Mapping[str, Any], folder: Path) -> BoolArray:
     """Return which cells are occupied, (rows, columns), first row in the north."""
     mode, image = facts.get('mode', 'trinary'), facts.get('image')
     if mode not in _MODES:
-        raise ValueError(f'mode: read {mode}, allowed are {", ".join(_MODES)}')
+        raise ValueError(f'mode: read {shown(mode)}, allowed are {", ".join(_MODES)}')
     if not isinstance(image, str) or not image:
-        raise ValueError(f'image: read {image}, allowed is the name of a file')
+        raise ValueError(f'image: read {shown(image)}, allowed is the name of a file')
     threshold = _number(facts, 'occupied_thresh')
     if not 0.0 <= threshold <= 1.0:
         raise ValueError(f'occupied_thresh: read {threshold:g}, allowed are numbers from 0 to 1')

@@ -8,6 +8,7 @@ import numpy as np
 
 from maasi_filter.arrays import FloatArray
 from maasi_filter.geometry.area import Area
+from maasi_filter.wording import point
 
 MARGIN = 0.5  # drift outside at which the driver acts [m]
 
@@ -30,7 +31,7 @@ class OperatingVolume:
             return problem
         if not self.area.inside([position], bounded=False)[0]:
             allowed = 'what lies inside the area and outside of its keep-outs'
-            return f': read {list(position)}, allowed is {allowed}'
+            return f': read {point(position)}, allowed is {allowed}'
         if self.area.terrain is None:
             problem = _beyond(self.limits, position)
             return problem and f'{problem}, the geofence'
@@ -78,5 +79,5 @@ class OperatingVolume:
 def _beyond(limits: FloatArray, position: Sequence[float]) -> str:
     for axis, value, (low, high) in zip('xyz', position, limits.tolist()):
         if not low <= value <= high:
-            return f'.{axis}: read {value}, allowed is {low:g} to {high:g} [m]'
+            return f'.{axis}: read {value:.6g}, allowed is {low:g} to {high:g} [m]'
     return ''

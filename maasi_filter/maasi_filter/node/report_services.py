@@ -148,7 +148,7 @@ class ReportServices:
                 later.append((first, report))
             elif report.target and report.target not in search.reviewable():
                 # Withdrawn since it was accepted.
-                self._node.drop('bad statement', f'{report}: is not found any more')
+                self._node.drop('bad statement', f'{report}: the target is no longer found')
             else:
                 used.append(self._use(report, stamp))
         self._waiting = later

@@ -61,7 +61,8 @@ def bounded(name: str, values: Iterable[float], limit: float) -> None:
     # Also false for NaN.
     if not all(abs(value) <= limit for value in values):
         raise ValueError(
-            f'{name}: got {list(values)}, allowed are finite numbers up to {limit:g} in magnitude'
+            f'{name}: got {np.asarray(values).tolist()}, allowed are finite numbers up to '
+            f'{limit:g} in magnitude'
         )
 
 

@@ -94,7 +94,7 @@ class LockstepLifecycleNode(ReadyNode, Generic[SettingsT]):
         except SettingsError as error:
             self.problem = str(error)
         except Exception as error:
-            self.problem = f'configure failed: {error!r}'
+            self.problem = f'configure failed: {type(error).__name__}: {error}'
             self.get_logger().error(traceback.format_exc())
         if self.problem:
             self.get_logger().error(f'not configured: {self.problem}')

@@ -14,6 +14,7 @@ from maasi_filter.geometry.environment import EnvironmentSettings
 from maasi_filter.geometry.geodesy import OriginSettings, geodetic, to_map
 from maasi_filter.geometry.geojson import is_geojson, points_of
 from maasi_filter.geometry.polygons import InputWarning
+from maasi_filter.wording import shown
 from maasi_sim.scenario.layering import Layer, ScenarioError
 
 _DEGREES = {'latitude': 90.0, 'longitude': 180.0}
@@ -21,11 +22,11 @@ _DEGREES = {'latitude': 90.0, 'longitude': 180.0}
 
 def position_text(position: list[float], origin: OriginSettings | None) -> str:
     """Return a position [m, map] as text, with latitude and longitude if there is an origin."""
-    text = ' '.join(f'{value + 0.0:.4g}' for value in position)
+    text = f'({", ".join(f"{value + 0.0:.4g}" for value in position)}) m'
     if origin is None:
-        return f'{text} m'
+        return text
     latitude, longitude = geodetic(np.array([position]), origin)[0, :2].tolist()
-    return f'{text} m ({latitude:.6f}, {longitude:.6f})'
+    return f'{text}, latitude {latitude:.6f}, longitude {longitude:.6f}'
 
 
 def outside_text(position: list[float], area: Area) -> str:
@@ -99,7 +100,8 @@ def _on_map(
             or not isinstance(number, (int, float))
             or not -most <= number <= most
         ):
-            text = f'{key}: {axis}: read {number}, allowed is a number from {-most:g} to {most:g}'
+            read = shown(number) if axis in value else 'nothing'
+            text = f'{key}: {axis}: read {read}, allowed is a number from {-most:g} to {most:g}'
             raise ScenarioError(layer.located(text))
         numbers[axis] = float(number)
     height, others = value.get('height', 0.0), value.keys() - _DEGREES.keys() - {'height'}

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from rosbags.typesys.store import Typestore
 
 from maasi_filter.ros.parameters import flatten
-from maasi_filter.wording import number
+from maasi_filter.wording import number, point
 from maasi_planner.buildings.settings import CuboidPlannerSettings
 from maasi_sim.run.buildings.observer import (
     CuboidObserver,
@@ -42,13 +42,15 @@ class BuildingMission(Mission[CuboidRecord]):
         """See `Mission.preflight`."""
         scenario = self.scenario
         sides = (scenario.environment.array() @ [-1.0, 1.0]).tolist()
-        starts = [f'{name}: starts at {robot.start} m' for name, robot in scenario.robots.items()]
+        starts = [
+            f'{name}: starts at {point(robot.start)} m' for name, robot in scenario.robots.items()
+        ]
         cuboids = len(scenario.mission().cells)
         return Preflight(
             [
                 f'space: {" x ".join(map(number, sides))} m, {cuboids} cuboids to visit',
                 *starts,
-                f'time limit {number(scenario.limits.time)} s',
+                f'the time limit is {number(scenario.limits.time)} s',
             ]
         )
 
