@@ -67,6 +67,11 @@ class Progress:
 def load_filter(path: str | os.PathLike[str]) -> SearchFilter:
     """Return a saved filter, which continues bit for bit.
 
+    Parameters
+    ----------
+    path : str or path
+        File that `SearchFilter.save` wrote.
+
     Raises
     ------
     StateFileError

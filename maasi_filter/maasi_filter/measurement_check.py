@@ -27,7 +27,25 @@ REPEATED = 'repeated'
 
 @dataclass
 class CheckedMeasurement:
-    """A valid measurement whose detections all have covariances and are in a fixed order."""
+    """A valid measurement whose detections all have covariances and are in a fixed order.
+
+    Attributes
+    ----------
+    robot : str
+        Name of the robot.
+    pose : Pose
+        Pose of the robot [m, map].
+    sensor : Sensor
+        Its sensor.
+    values : (m, d) array
+        Range [m], bearing and, in 3D, elevation [rad] of each detection.
+    covariances : (m, d, d) array
+        Covariances of `values` [m, rad].
+    has_covariances : bool
+        Whether the measurement had them; otherwise they are those of the sensor.
+    index : int
+        Number of the measurement of this robot.
+    """
 
     robot: str
     pose: Pose
@@ -58,7 +76,31 @@ def check_measurements(
     settings: FilterSettings,
     dimension: int,
 ) -> list[CheckedMeasurement]:
-    """Return the valid measurements of a step in the order of the robots' names."""
+    """Return the valid measurements of a step in the order of the robots' names.
+
+    Parameters
+    ----------
+    measurements : sequence of AgentMeasurement
+        One for each robot that measured.
+    steps : int
+        Steps since the previous call.
+    time : float
+        Since the first step [s].
+    settings : FilterSettings
+        Of the filter.
+    dimension : int
+        2 or 3.
+
+    Returns
+    -------
+    list of CheckedMeasurement
+        With `values` (m, d): range [m], bearing and, in 3D, elevation [rad].
+
+    Raises
+    ------
+    ValueError
+        If a number is not finite, a shape or covariance is wrong, or a robot occurs twice.
+    """
     if isinstance(steps, bool) or int(steps) != steps or steps < 0:
         raise ValueError(f'steps: got {steps!r}, allowed are whole numbers from 0')
     if not math.isfinite(time):

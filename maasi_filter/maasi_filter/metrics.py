@@ -101,7 +101,27 @@ class Match:
 
 
 def match_targets(estimates: ArrayLike, truth: ArrayLike, radius: float) -> Match:
-    """Match as many found targets as possible to true ones within `radius` [m], closest first."""
+    """Match as many found targets as possible to true ones, closest first.
+
+    Parameters
+    ----------
+    estimates : (m, d) array
+        Found targets [m].
+    truth : (n, d) array
+        True targets [m].
+    radius : float
+        Largest distance of a pair [m].
+
+    Returns
+    -------
+    Match
+        Pairs of indices, counts, and the root mean square distance [m].
+
+    Raises
+    ------
+    ValueError
+        If shapes do not fit or `radius` is not above 0.
+    """
     _positive('radius', radius)
     apart = _distances(estimates, truth)
     # One more pair outweighs any sum of distances.

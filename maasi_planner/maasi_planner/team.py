@@ -160,9 +160,15 @@ class TeamView:
 class UsableCandidates:
     """Candidates of one planning robot.
 
-    points (W, 3): waypoints moved out of obstacles, metres; prediction: trajectories to them;
-    allowed (W,): reachable, not the present position, and apart from the final positions of other
-    robots.
+    Attributes
+    ----------
+    points : (W, 3) array
+        Waypoints, moved out of obstacles [m, map].
+    prediction : Trajectories
+        Predicted trajectories to them.
+    allowed : (W,) array of bool
+        Which are reachable with the battery, other than the present position, and clear of the
+        other robots.
     """
 
     points: FloatArray
@@ -239,7 +245,23 @@ class RobotDecision:
 
 @dataclass
 class Decision:
-    """Joint decision for all planning robots."""
+    """Joint decision for all planning robots.
+
+    Attributes
+    ----------
+    step : int
+        Step k at which it was made.
+    robots : dict of RobotDecision
+        Decision of each planning robot, by name.
+    objective : float
+        J of the chosen joint candidate.
+    exact : bool
+        Whether all joint candidates were compared.
+    evaluated : int
+        Number of joint candidates that were evaluated.
+    reason : str
+        Why, for log and page.
+    """
 
     step: int
     robots: dict[str, RobotDecision] = field(default_factory=dict)
@@ -252,7 +274,23 @@ class Decision:
 def single_choice(
     points: FloatArray, prediction: Trajectories, chosen: int, reason: str
 ) -> RobotDecision:
-    """Return a decision without the terms of J."""
+    """Return the decision for a candidate, without the terms of J.
+
+    Parameters
+    ----------
+    points : (W, 3) array
+        Candidates [m, map].
+    prediction : Trajectories
+        Their predicted trajectories.
+    chosen : int
+        Index of the chosen candidate.
+    reason : str
+        Why, for log and page.
+
+    Returns
+    -------
+    RobotDecision
+    """
     length = int(prediction.lengths[chosen])
     return RobotDecision(
         chosen=chosen,
@@ -271,7 +309,19 @@ def single_choice(
 
 
 def stay(view: RobotView, reason: str) -> RobotDecision:
-    """Return the decision to stay."""
+    """Return the decision to stay.
+
+    Parameters
+    ----------
+    view : RobotView
+        The robot.
+    reason : str
+        Why, for log and page.
+
+    Returns
+    -------
+    RobotDecision
+    """
     empty = np.zeros(0)
     return RobotDecision(
         chosen=-1,

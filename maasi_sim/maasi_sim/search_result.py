@@ -9,10 +9,19 @@ from maasi_sim.run.targets.tables import columns, found_rows
 
 
 class SearchResult(RunLog):
-    """The log of a search; see `RunLog`."""
+    """Result of a search in one process: found targets, scores, progress and events.
+
+    `found_targets`, `missed`, `rmse` [m], `total_measurements`, `progress` and `end_reason` are
+    those of `RunLog`.
+    """
 
     def save_replay(self, path: str | Path) -> None:
         """Write a page that shows the search, as one HTML file.
+
+        Parameters
+        ----------
+        path : str or Path
+            File to write.
 
         Raises
         ------

@@ -197,7 +197,13 @@ class AgentDriver(RobotNode):
         }
 
     def take_pose(self, placed: StampedPose) -> None:
-        """Handle the robot's pose with a control step."""
+        """Handle the robot's pose with a control step.
+
+        Parameters
+        ----------
+        placed : StampedPose
+            Pose in frame `map` [m], velocity [m/s], and the time [ns] at which they were true.
+        """
         area = self.volume.area
         if area.terrain is not None and self.follower.on_ground:
             # Odometry of ground robots is that of a plane.
@@ -253,7 +259,13 @@ class AgentDriver(RobotNode):
                 self.end_goal(GoalStatus.ABORTED, 'path blocked by a keep-out zone')
 
     def take_charge(self, charge: float) -> None:
-        """Update the battery charge, 0 to 1; other values are unknown."""
+        """Update the battery charge.
+
+        Parameters
+        ----------
+        charge : float
+            Share of a full battery, 0 to 1; other values count as unknown.
+        """
         self._watchdog.update_charge(charge)
 
     def receive_frame(self, topic: str, stamp: int, data: Any, *, repeated: bool = False) -> None:
@@ -326,6 +338,11 @@ def run(
         What makes the sensor, as `CameraInput`.
     arguments : list of str, optional
         Of the command line.
+
+    Returns
+    -------
+    int
+        0: ended as asked, 1: failed, 2: wrong parameters.
     """
     links = link if isinstance(link, Mapping) else {'topics': link}
     return run_node(lambda: AgentDriver(links, sensor), arguments, AgentDriver)

@@ -55,6 +55,18 @@ class SensorInput(ABC, Generic[DataT]):
     def detect(self, data: DataT, pose: StampedPose) -> SensorReading:
         """Return the detections in an image or sweep.
 
+        Parameters
+        ----------
+        data : image or sweep
+            What was passed to `driver.receive_frame`.
+        pose : StampedPose
+            Pose of the robot at the stamp of `data`, with its covariance.
+
+        Returns
+        -------
+        SensorReading
+            With ranges [m] and angles [rad] from the robot, and their covariances.
+
         Raises
         ------
         ValueError

@@ -93,9 +93,32 @@ class RobotLink(LinkHooks, ABC):
         return make_motion(settings.motion, self.driver.volume.area, settings.radius)
 
     def steer(self, robot: RobotState, step: int | None) -> tuple[FloatArray, Goal | None]:
-        """Return the command (4,) and the goal reached; see `WaypointFollower.update`."""
+        """Return the command for a pose.
+
+        Parameters
+        ----------
+        robot : RobotState
+            Present state of the robot.
+        step : int or None
+            In lockstep the step.
+
+        Returns
+        -------
+        command : (4,) array
+            vx, vy, vz [m/s, axes turned by the heading] and yaw rate [rad/s].
+        goal : Goal or None
+            The goal that was reached.
+        """
         return self.driver.follower.update(robot, step)
 
     def is_moving(self, placed: StampedPose, command: FloatArray) -> bool:
-        """Return whether this command must change pose and images."""
+        """Return whether this command must change pose and images.
+
+        Parameters
+        ----------
+        placed : StampedPose
+            Present pose.
+        command : (4,) array
+            vx, vy, vz [m/s] and yaw rate [rad/s].
+        """
         return bool(math.hypot(*command[:3]) > 0.02 or abs(command[3]) > 0.05)

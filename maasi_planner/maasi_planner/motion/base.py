@@ -188,6 +188,17 @@ class MotionModel(ABC):
         a length beyond the last column, or minus the number of filled columns. Models of the suite
         override this by compiled loops; this one calls `command` and `body`, with about ten
         microseconds per step.
+
+        Parameters
+        ----------
+        state : RobotState
+            Present state.
+        waypoints : (W, 3) array
+            Waypoints [m, map].
+        step : float
+            Time between two columns of `out` [s].
+        out : Trajectories
+            Arrays to fill, without values.
         """
         limit = out.positions.shape[1] - 1
         for w, waypoint in enumerate(waypoints):
@@ -208,11 +219,30 @@ class MotionModel(ABC):
 
     @abstractmethod
     def command(self, state: RobotState, waypoint: ArrayLike) -> FloatArray:
-        """Return the velocity command vx, vy, vz [m/s, body], yaw rate [rad/s], shape (4,)."""
+        """Return the velocity command towards a waypoint.
+
+        Parameters
+        ----------
+        state : RobotState
+            Present state.
+        waypoint : (3,) array
+            Waypoint [m, map].
+
+        Returns
+        -------
+        (4,) array
+            vx, vy, vz [m/s, body axes rotated only by the heading] and yaw rate [rad/s].
+        """
 
     @abstractmethod
     def body(self, state: RobotState) -> Body:
-        """Return a body of this robot at `state`."""
+        """Return a body of this robot, for prediction and simulation.
+
+        Parameters
+        ----------
+        state : RobotState
+            Where it starts.
+        """
 
     def arrived(self, position: ArrayLike, waypoint: ArrayLike) -> bool:
         """Return whether `position` is within the tolerance of `waypoint`, both (3,)."""

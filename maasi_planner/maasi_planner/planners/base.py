@@ -50,13 +50,35 @@ class Planner(ABC):
 
     @abstractmethod
     def decide(self, team: TeamView) -> Decision:
-        """Return a decision for every planning robot; one without an admissible waypoint stays."""
+        """Return a decision for every planning robot; one without an admissible waypoint stays.
+
+        Parameters
+        ----------
+        team : TeamView
+            The team at this step: positions in metres, frame `map`.
+
+        Returns
+        -------
+        Decision
+            With a `RobotDecision` for exactly the robots of `team.planning()`, which
+            `single_choice` and `stay` make. Waypoints lie inside the area.
+        """
 
     def finished(self, team: TeamView) -> str | None:
         """Return why the search has ended, or None.
 
         It ends when `explored_threshold` of the area is explored and no cluster has a mass of
         `mass_threshold` or more.
+
+        Parameters
+        ----------
+        team : TeamView
+            The team at this step.
+
+        Returns
+        -------
+        str or None
+            The reason, for log and report.
         """
         explored = team.exploration.explored_fraction()
         if explored < self.settings.explored_threshold:

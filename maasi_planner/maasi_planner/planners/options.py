@@ -51,7 +51,18 @@ def usable_candidates(
 
 
 def waiting_places(team: TeamView) -> list[tuple[FloatArray, float]]:
-    """Return final positions (3,) [m] and radii of the robots that do not plan."""
+    """Return final positions (3,) [m, map] and radii [m] of the robots that do not plan.
+
+    Parameters
+    ----------
+    team : TeamView
+        The team at this step.
+
+    Returns
+    -------
+    list of (3,) array and float
+        For `options_of`; append the waypoint and radius of each robot that was decided.
+    """
     standing = list(team.taken)
     for name in team.names():
         view = team.robots[name]
@@ -71,7 +82,24 @@ def options_of(
     standing: list[tuple[FloatArray, float]],
     extra: FloatArray | None = None,
 ) -> UsableCandidates | str:
-    """Return the candidates of a robot, or why it has to stay."""
+    """Return the candidates of a robot, or why it has to stay.
+
+    Parameters
+    ----------
+    team : TeamView
+        The team at this step.
+    name : str
+        A robot that plans.
+    standing : list of (3,) array and float
+        Final positions [m, map] and radii [m] of the robots that have their waypoints.
+    extra : (n, 3) array, optional
+        Further candidates [m, map].
+
+    Returns
+    -------
+    UsableCandidates or str
+        The candidates, or the reason.
+    """
     view = team.robots[name]
     if not len(view.candidates) and (extra is None or not len(extra)):
         return 'it has no candidates'

@@ -47,7 +47,20 @@ class RunEnd:
 class Count:
     """Measurements and found targets of all robots after a filter update.
 
-    rmse: of the true finds [m], nan without any; members: robots that measured.
+    Attributes
+    ----------
+    time : float
+        Since the first step [s].
+    step : int
+        Step of the update.
+    measurements, found, true_found : int
+        Numbers until then.
+    rmse : float
+        Of the true finds [m]; nan without any.
+    members : tuple of str
+        Robots that measured.
+    positions : dict of (3,) arrays
+        Positions of the robots [m, map].
     """
 
     time: float

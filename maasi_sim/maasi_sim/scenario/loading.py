@@ -57,7 +57,18 @@ def config_folder() -> Path:
 
 
 def find_scenario(name: str | Path) -> Path:
-    """Return the file of a scenario: a path, or the name of one in `config/scenarios`."""
+    """Return the file of a scenario.
+
+    Parameters
+    ----------
+    name : str or Path
+        A file, or the name of a scenario in `config/scenarios`.
+
+    Raises
+    ------
+    ScenarioError
+        If no scenario has this name.
+    """
     path = Path(name)
     if path.exists() or path.suffix or len(path.parts) > 1:
         return path
@@ -82,6 +93,15 @@ def load_scenario(
         Scenario file, or the name of one in `config/scenarios`.
     overrides : mapping, optional
         Values that override the file's: origin (for messages), key and value.
+
+    Returns
+    -------
+    Scenario
+
+    Raises
+    ------
+    ScenarioError
+        If the file cannot be read, or a key is not allowed; names file, line and key.
     """
     return check_scenario(read_scenario(path), overrides)
 

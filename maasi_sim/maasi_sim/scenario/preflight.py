@@ -180,8 +180,9 @@ def _add_team(
     time = _time_of_pass(efforts, whole)
     endless = time >= _LONGEST
     charges = {name: effort.working(time)[1] for name, effort in efforts.items()}
-    needed = ', '.join(f'{name} {n}' for name, n in charges.items() if n)
-    charging = f'charges: {needed}' if needed else 'no charging needed'
+    often = {name: 'once' if n == 1 else f'{n} times' for name, n in charges.items() if n}
+    needed = ', '.join(f'{name} charges {text}' for name, text in often.items())
+    charging = needed or 'no charging needed'
     takes = f'takes {_time(time)}; {charging}'
     if endless:
         takes = 'needs more than all batteries'
