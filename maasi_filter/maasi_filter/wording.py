@@ -28,8 +28,11 @@ def number(value: float) -> str:
 
 
 def point(values: Iterable[float]) -> str:
-    """Return coordinates for people."""
-    return f'({", ".join(map(number, values))})'
+    """Return coordinates for people; 0 for those that are small next to the largest one."""
+    given = list(values)
+    least = 1e-3 * max((abs(value) for value in given if math.isfinite(value)), default=0.0)
+    rounded = [0.0 if abs(value) < least else value for value in given]
+    return f'({", ".join(map(number, rounded))})'
 
 
 def counted(count: int, noun: str) -> str:

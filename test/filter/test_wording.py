@@ -1,5 +1,6 @@
 """Numbers as people read them."""
 
+import math
 import re
 
 import pytest
@@ -22,4 +23,6 @@ def test_numbers_have_three_significant_digits_and_zero_has_no_sign(value):
 def test_infinite_numbers_points_and_counts():
     assert [number(value) for value in (float('inf'), float('nan'), -0.0)] == ['-', '-', '0']
     assert point([1.23456, -0.0, 1234.5]) == '(1.23, 0, 1234)'
+    assert point([73.7, 4.5e-4]) == '(73.7, 0)'
+    assert point([4.5e-4, math.nan]) == '(0.00045, -)'
     assert [counted(n, 'find') for n in range(3)] == ['0 finds', '1 find', '2 finds']

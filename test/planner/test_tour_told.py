@@ -13,6 +13,7 @@ from maasi_filter.models.detection import BoxDetection
 from maasi_filter.models.sensor import Sensor
 from maasi_filter.records import Cluster
 from maasi_filter.unexplored_map import UnexploredMap
+from maasi_filter.wording import point
 from maasi_planner import MotionSettings, RobotState, RobotView, TeamView, make_motion, make_planner
 from maasi_planner.conversions import decision_to_ros
 from maasi_planner.planners.base import check_decision
@@ -87,7 +88,7 @@ def test_each_waypoint_has_a_reason_with_numbers_also_in_nodes(name, seed):
         # Straight runs are one leg, whose end may be moved out of a zone.
         assert np.linalg.norm([float(word) for word in place.groups()] - item.waypoint[:2]) < 3.0
         first = tour.points[tour.routes[robot][0]]
-        assert f'; then ({first[0]:.4g}, {first[1]:.4g}) m' in text
+        assert f'; then {point(first)} m' in text
         assert re.search(
             r'; the alternative \(.*\) m, .* m away, is (later|assigned to \w+)$', text
         )

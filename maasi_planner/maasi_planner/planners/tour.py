@@ -6,6 +6,7 @@ import numpy as np
 
 from maasi_filter.arrays import FloatArray
 from maasi_filter.geometry.area import Area
+from maasi_filter.wording import point as shown_point
 from maasi_planner.planners.base import Planner, explain
 from maasi_planner.planners.detour import PASSES, others_move, past_standing
 from maasi_planner.planners.flights import flights_of
@@ -232,8 +233,7 @@ class Tour(Planner):
 
     def _reason(self, name: str, here: FloatArray, index: int, prizes: FloatArray) -> str:
         def named(stop: int) -> str:
-            numbers = ', '.join(f'{value:.4g}' for value in self.points[stop])
-            return f'({numbers}) m'
+            return f'{shown_point(self.points[stop])} m'
 
         def gain(stop: int) -> str:
             potential = 'a potential target of mass ' if stop >= len(self._chosen) else ''
