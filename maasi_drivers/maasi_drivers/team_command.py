@@ -6,7 +6,8 @@ import re
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
+from functools import partial
 from typing import Any
 
 import rclpy
@@ -18,6 +19,7 @@ from rclpy.signals import SignalHandlerOptions
 from std_srvs.srv import Trigger
 
 from maasi_filter.ros.qos import SENSOR
+from maasi_filter.ros.report_client import call_services
 from maasi_msgs.action import GoToWaypoint
 from maasi_msgs.msg import AgentState
 from maasi_planner.node.search_modes import COMMANDS
@@ -47,7 +49,6 @@ _STATUS = {
     AgentState.ABORTED: 'goal aborted',
     AgentState.UNAVAILABLE: 'unavailable',
 }
-_SETTLED = 1.0  # discovery ends this long after the last new service [s]
 _CANCEL_TIME = 5.0  # longest wait for the answer to a cancelled goal [s]
 
 
@@ -96,7 +97,7 @@ def _path(*names: str) -> str:
     return ''.join(f'/{part}' for name in names for part in name.split('/') if part)
 
 
-def wanted(services: dict[str, list[str]], options: argparse.Namespace) -> set[str]:
+def wanted(services: Mapping[str, list[str]], options: argparse.Namespace) -> set[str]:
     """Return the available services that a command calls."""
     command, robots, top = options.command, options.robots, _path(options.namespace)
     known = {name for name, types in services.items() if 'std_srvs/srv/Trigger' in types}
@@ -124,28 +125,13 @@ def _without(services: Iterable[str], options: argparse.Namespace) -> list[str]:
 
 def call_all(node: Node, options: argparse.Namespace) -> dict[str, Any]:
     """Call each service when it is discovered; return the answers, None without one."""
-    executor = SingleThreadedExecutor(context=node.context)
-    executor.add_node(node)
-    calls: dict[str, Any] = {}
-    clients: dict[str, Any] = {}
-    answers: dict[str, Any] = {}
-    begin = changed = time.monotonic()
-    while time.monotonic() - begin < options.timeout:
-        found = wanted(dict(node.get_service_names_and_types()), options)
-        # Without the team's planner the discovered services may cover only some robots.
-        for name in sorted(found - set(clients)):
-            clients[name] = node.create_client(Trigger, name)
-            changed = time.monotonic()
-        for name, client in clients.items():
-            if name not in calls and client.service_is_ready():
-                calls[name] = client.call_async(Trigger.Request())
-        executor.spin_once(timeout_sec=0.05)
-        answers = {name: call.result() for name, call in calls.items() if call.done()}
-        done = clients and len(answers) == len(clients) and not _without(clients, options)
-        if done and time.monotonic() - changed > _SETTLED:
-            break
-    executor.shutdown()
-    return dict.fromkeys(clients) | answers
+
+    # Without the team's planner the discovered services may cover only some robots.
+    def complete(names: Iterable[str], settled: bool) -> bool:
+        return settled and not _without(names, options)
+
+    request, found = Trigger.Request(), partial(wanted, options=options)
+    return call_services(node, Trigger, request, found, complete, options.timeout)
 
 
 def _call(node: Node, options: argparse.Namespace) -> int:

@@ -11,6 +11,7 @@ from std_msgs.msg import Header
 from maasi_filter.arrays import FloatArray
 from maasi_filter.ros.clocks import Silence, StampGate
 from maasi_filter.ros.conversions import stamp_from_ros, stamp_of_step, stamp_to_ros
+from maasi_filter.ros.keep_outs import KeepOutTopic
 from maasi_filter.ros.lifecycle_node import LockstepLifecycleNode
 from maasi_filter.ros.qos import RELIABLE
 from maasi_filter.ros.run_node import run
@@ -23,7 +24,6 @@ from maasi_planner.homing import CUT_OFF
 from maasi_planner.node.batches import Batches
 from maasi_planner.node.battery_log import BatteryLog
 from maasi_planner.node.filter_guard import FilterGuard, FoundKeeper
-from maasi_planner.node.keep_out_service import KeepOutService
 from maasi_planner.node.orders import Orders
 from maasi_planner.node.other_planners import OtherPlanners
 from maasi_planner.node.reports import Reports
@@ -149,7 +149,7 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
         self.goals = self.orders.set_up(names, self._try_done)
         self._action = SearchAction(self, lambda: self._command('start', None), self._stand)
         offer_services(self, names, self._command)
-        KeepOutService(self, lambda area: self.coordinator.adopt_area(area))
+        KeepOutTopic(self, lambda area: self.coordinator.adopt_area(area), True, 'search/keep_outs')
         self.create_wall_timer(_CHECK_PERIOD, self._check_team)
 
     def start(self) -> None:

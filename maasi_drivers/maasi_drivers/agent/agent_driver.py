@@ -305,24 +305,20 @@ class AgentDriver(RobotNode):
             self.end_goal(GoalStatus.ABORTED, 'left')
             self.follower.let_go()
 
-    def _on_stop(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+    def _on_stop(self, _: Trigger.Request) -> tuple[bool, str]:
         self._stop_latched = True
         if self.configured:
             self.health.begin(STOP, STOPPED)
             if self.active and not self.settings.lockstep:
                 self.link.hold()
             self.link.latch_stop()
-        response.success = True
-        response.message = 'robot stopped; goals are refused until release'
-        return response
+        return True, 'robot stopped; goals are refused until release'
 
-    def _on_release(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+    def _on_release(self, _: Trigger.Request) -> tuple[bool, str]:
         was, self._stop_latched = self._stop_latched, False
         if self.configured:
             self.health.end(STOP, 'released: goals are accepted')
-        response.success = True
-        response.message = 'robot released' if was else 'the robot was not stopped'
-        return response
+        return True, 'robot released' if was else 'the robot was not stopped'
 
 
 def run(

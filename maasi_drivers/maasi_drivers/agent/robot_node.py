@@ -230,19 +230,17 @@ class RobotNode(LockstepLifecycleNode[DriverSettings], ABC):
     def offer_arm(self, arm: Callable[[], str], in_air: Callable[[], bool] = lambda: False) -> None:
         """Offer the service `arm` of a robot that takes off, or is taken over `in_air`."""
 
-        def answer(_: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        def answer(_: Trigger.Request) -> tuple[bool, str]:
             problem = '' if self.active else 'the driver is not active'
             problem = problem or self.health.get(STOP) or self.health.get(BATTERY) or arm()
-            response.success = not problem
             if problem:
-                response.message = problem
                 self.get_logger().warning(f'arm: refused: {problem}')
-                return response
-            response.message = 'taking off as soon as it is ready'
+                return False, problem
+            message = 'taking off as soon as it is ready'
             if in_air():
-                response.message = 'in the air: taking control at its position'
-            self.get_logger().info(f'arm: {response.message}')
-            return response
+                message = 'in the air: taking control at its position'
+            self.get_logger().info(f'arm: {message}')
+            return True, message
 
         self.offer_service('arm', answer)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any, Protocol
+from typing import Any
 
 from rclpy.duration import Duration
 from std_msgs.msg import Header
@@ -28,11 +28,6 @@ from maasi_msgs.msg import Report as ReportMessage
 from maasi_msgs.srv import AddSighting, MarkSearched, ReviewTarget
 
 _PATIENCE = 0.5  # longest wait for readers to acknowledge a report, in lockstep [s]
-
-
-class _Response(Protocol):
-    success: bool
-    message: str
 
 
 class ReportServices:
@@ -62,17 +57,12 @@ class ReportServices:
         """Offer the services."""
         node = self._node
         self._publisher = node.create_publisher(ReportMessage, 'reports', LATCHED_ALL)
-        self._offer('search/review_target', ReviewTarget, self._review)
-        self._offer('search/add_sighting', AddSighting, self._sighting)
-        self._offer('search/mark_searched', MarkSearched, self._searched)
-
-    def _offer(self, name: str, kind: type, read: Callable[[Any], Report]) -> None:
-        node = self._node
-        service: Any = node.permanent(
-            node.resolve_service_name(name),
-            lambda: node.create_service(kind, name, lambda _, answer: answer),
-        )
-        service.callback = partial(self._take, read)
+        for name, kind, read in (
+            ('review_target', ReviewTarget, self._review),
+            ('add_sighting', AddSighting, self._sighting),
+            ('mark_searched', MarkSearched, self._searched),
+        ):
+            node.offer_service(f'search/{name}', partial(self._accept, read), kind)
 
     @property
     def _frame(self) -> str:
@@ -107,7 +97,7 @@ class ReportServices:
         zone = request.zone if origin is None else zone_on_map(request.zone, origin)
         return searched(zone, probability, request.source, environment, search.area)
 
-    def _take(self, read: Callable[[Any], Report], request: Any, answer: _Response) -> _Response:
+    def _accept(self, read: Callable[[Any], Report], request: Any) -> tuple[bool, str]:
         try:
             if not self._node.active:
                 raise ValueError('the filter is not active')
@@ -116,19 +106,16 @@ class ReportServices:
                 raise ValueError(f'allowed are {MOST_REPORTS} statements in one search')
             report = read(request)
         except ValueError as error:
-            answer.message = str(error)
             self._node.get_logger().warning(f'refused statement: {error}')
-            return answer
-        answer.success, answer.message = True, str(report)
+            return False, str(error)
         if self._node.settings.lockstep:
             self._waiting.append((int(request.step), report))
-            answer.message += '; waits for the next batch'
-        else:
-            used = self._use(report, self._node.get_clock().now().nanoseconds)
-            answer.message += self._effect(used)
-            self._on_used()
-            self.publish([used])
-        return answer
+            return True, f'{report}; waits for the next batch'
+        used = self._use(report, self._node.get_clock().now().nanoseconds)
+        effect = self._effect(used)
+        self._on_used()
+        self.publish([used])
+        return True, f'{report}{effect}'
 
     def _effect(self, report: Report) -> str:
         if not report.target:

@@ -14,30 +14,45 @@ from maasi_filter.ros.lifecycle_node import LockstepLifecycleNode
 from maasi_filter.ros.qos import LATCHED, LATCHED_ALL
 from maasi_filter.wording import problems
 from maasi_msgs.msg import KeepOuts
+from maasi_msgs.srv import SetKeepOuts
 
 # Most zones, and most corners of their polygons, in a request.
 ZONES, CORNERS = 1000, 10_000
 
 
 class KeepOutTopic:
-    """The area with the active keep-outs; `keep` republishes them, to outlive their sender."""
+    """The area with the active keep-outs; `on_change` receives each changed area.
+
+    `keep` republishes them, to outlive their sender; `service` offers a service to change them.
+    """
 
     def __init__(
-        self, node: LockstepLifecycleNode[Any], on_change: Callable[[Area], None], keep: bool
+        self,
+        node: LockstepLifecycleNode[Any],
+        on_change: Callable[[Area], None],
+        keep: bool,
+        service: str = '',
     ) -> None:
         self._node, self._on_change = node, on_change
         self._latest = KeepOuts()
-        self._asked = False  # whether the latest ones are from `change`
+        self._asked = False  # whether the latest ones are from the service
         topic = node.team_topic('keep_outs')
         self._publisher = node.create_publisher(KeepOuts, topic, LATCHED) if keep else None
         node.create_subscription(KeepOuts, topic, self._take, LATCHED_ALL)
+        if service:
+            node.offer_service(service, self._change, SetKeepOuts)
 
-    def change(self, zones: Sequence[str]) -> None:
-        """Publish other keep-outs; ValueError names an invalid one."""
+    def _change(self, request: SetKeepOuts.Request) -> tuple[bool, str]:
+        if not self._node.active:
+            return False, 'the planner is not active'
         frame, version = self._node.settings.frame, self._latest.version + 1
         header = Header(stamp=self._node.get_clock().now().to_msg(), frame_id=frame)
-        self._adopt(KeepOuts(header=header, version=version, zones=list(zones)))
+        try:
+            self._adopt(KeepOuts(header=header, version=version, zones=list(request.zones)))
+        except ValueError as error:
+            return False, str(error)
         self._asked = True
+        return True, f'active keep-outs: {len(request.zones)}'
 
     def _take(self, message: KeepOuts) -> None:
         latest = self._latest

@@ -55,13 +55,18 @@ class LockstepLifecycleNode(ReadyNode, Generic[SettingsT]):
         return '/' + '/'.join([*parts, name])
 
     def offer_service(
-        self, name: str, answer: Callable[[Trigger.Request, Trigger.Response], Trigger.Response]
+        self, name: str, answer: Callable[[Any], tuple[bool, str]], kind: Any = Trigger
     ) -> None:
-        """Offer a service (std_srvs/Trigger) that lives as long as the node."""
+        """Offer a service that lives as long as the node; `answer` returns success and message."""
+
+        def respond(request: Any, response: Any) -> Any:
+            response.success, response.message = answer(request)
+            return response
+
         service = self.permanent(
-            self.resolve_service_name(name), lambda: self.create_service(Trigger, name, answer)
+            self.resolve_service_name(name), lambda: self.create_service(kind, name, respond)
         )
-        service.callback = answer
+        service.callback = respond
 
     # ---- hooks of nodes ------------------------------------------------------------------------
 

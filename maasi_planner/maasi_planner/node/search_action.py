@@ -7,7 +7,6 @@ from typing import Any, TypeAlias
 
 from rclpy.action import ActionServer, CancelResponse, GoalResponse
 from rclpy.task import Future
-from std_srvs.srv import Trigger
 
 from maasi_filter.ros.lifecycle_node import LockstepLifecycleNode
 from maasi_msgs.action import SearchTargets
@@ -133,10 +132,7 @@ def offer_services(
     for service, robots in services.items():
         word = service.rpartition('/')[2]
 
-        def serve(
-            _: Any, response: Trigger.Response, word: str = word, robots: list[str] | None = robots
-        ) -> Trigger.Response:
-            response.success, response.message = commander(word, robots)
-            return response
+        def serve(_: Any, word: str = word, robots: list[str] | None = robots) -> tuple[bool, str]:
+            return commander(word, robots)
 
         node.offer_service(service, serve)
