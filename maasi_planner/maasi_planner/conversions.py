@@ -20,10 +20,13 @@ from maasi_filter.ros.clocks import LAST_STAMP, batch_id_limit
 from maasi_filter.ros.conversions import (
     FASTEST,
     bounded,
+    check_frame,
     cluster_from_ros,
     colour_of,
+    line_marker,
     point_to_ros,
     pose_from_ros,
+    shape_marker,
 )
 from maasi_filter.unexplored_map import UnexploredMap
 from maasi_msgs.msg import AgentState, Candidate, FilterUpdate, PlanDecision
@@ -139,22 +142,13 @@ def planner_markers(
             ('robots', position, Marker.SPHERE),
             ('waypoints', waypoint, Marker.CUBE),
         ):
-            marker = Marker(header=header, ns=namespace, id=number, type=shape)
-            marker.pose.position = point_to_ros(centre)
-            marker.pose.orientation.w = 1.0
-            marker.scale.x = marker.scale.y = marker.scale.z = size
-            marker.color = tint
-            markers.append(marker)
+            markers.append(shape_marker(header, namespace, number, centre, size, tint, shape))
         thinned = path[:: max(1, len(path) // 50)]
         for namespace, corners, width in (
             ('ways', thinned, 0.2 * size),
             ('tours', [waypoint, *tour], 0.07 * size),
         ):
-            line = Marker(header=header, ns=namespace, id=number, type=Marker.LINE_STRIP)
-            line.pose.orientation.w = 1.0
-            line.scale.x = width
-            line.color = tint
-            line.points = [point_to_ros(point) for point in corners]
+            line = line_marker(header, namespace, number, corners, width, tint)
             line.action = Marker.ADD if len(line.points) > 1 else Marker.DELETE
             markers.append(line)
     return MarkerArray(markers=markers)
@@ -166,25 +160,16 @@ def area_markers(area: Area, header: Header, size: float) -> MarkerArray:
     markers: list[Marker] = []
     for kind, shapes in area.shapes.items():
         for ring in shapely.get_rings(shapely.get_parts(shapes)):
-            line = Marker(header=header, ns=kind, id=len(markers), type=Marker.LINE_STRIP)
-            line.pose.orientation.w = 1.0
-            line.scale.x = 0.1 * size
-            line.color = colour_of(tints[kind])
-            line.points = [point_to_ros([x, y, 0.0]) for x, y in shapely.get_coordinates(ring)]
-            markers.append(line)
+            corners, tint = shapely.get_coordinates(ring), colour_of(tints[kind])
+            markers.append(line_marker(header, kind, len(markers), corners, 0.1 * size, tint))
     return MarkerArray(markers=markers)
-
-
-def _check_frame(header: Header, frame: str) -> None:
-    if header.frame_id != frame:
-        raise ValueError(f'header.frame_id: read {header.frame_id!r}, allowed is {frame!r}')
 
 
 def checked_state(name: str, message: AgentState, settings: PlannerNodeSettings) -> RobotState:
     """Return the state in a message on the topic of a robot."""
     if message.robot != name:
         raise ValueError(f'robot: read {message.robot!r}, allowed is {name!r}')
-    _check_frame(message.header, settings.frame)
+    check_frame(message.header, settings.frame)
     linear, angular = message.twist.linear, message.twist.angular
     velocity, rates = (linear.x, linear.y, linear.z), (angular.x, angular.y, angular.z)
     bounded('twist.linear', velocity, FASTEST)
@@ -199,7 +184,7 @@ def checked_update(
     message: FilterUpdate, names: Collection[str], settings: PlannerNodeSettings, batch: int
 ) -> tuple[list[Cluster], dict[str, Pose]]:
     """Return clusters and poses of an update; ValueError for unknown members and impossible ids."""
-    _check_frame(message.header, settings.frame)
+    check_frame(message.header, settings.frame)
     dimension = settings.environment.dimension
     clusters = [cluster_from_ros(item, dimension) for item in message.clusters]
     strangers = {item.robot for item in message.members} - set(names)

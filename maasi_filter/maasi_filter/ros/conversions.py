@@ -66,6 +66,12 @@ def bounded(name: str, values: Iterable[float], limit: float) -> None:
         )
 
 
+def check_frame(header: Header, frame: str) -> None:
+    """Refuse a message in another frame; ValueError names it."""
+    if header.frame_id != frame:
+        raise ValueError(f'header.frame_id: read {header.frame_id!r}, allowed is {frame!r}')
+
+
 def point_to_ros(position: Sequence[float] | FloatArray) -> Point:
     """Return a position of two or three coordinates [m]."""
     z = float(position[2]) if len(position) == 3 else 0.0
@@ -360,20 +366,36 @@ def colour(red: float, green: float, blue: float, alpha: float = 1.0) -> ColorRG
     return ColorRGBA(r=red, g=green, b=blue, a=alpha)
 
 
-def sphere_marker(
+def shape_marker(
     header: Header,
     namespace: str,
     number: int,
     position: FloatArray,
-    diameter: float,
+    size: float | FloatArray,
     tint: ColorRGBA,
+    kind: int = Marker.SPHERE,
 ) -> Marker:
-    """Return a sphere, which namespace and number identify between messages."""
-    marker = Marker(header=header, ns=namespace, id=number, type=Marker.SPHERE, action=Marker.ADD)
+    """Return a marker of one size or (3,), which namespace and number identify."""
+    marker = Marker(header=header, ns=namespace, id=number, type=kind, color=tint)
     marker.pose.position = point_to_ros(position)
     marker.pose.orientation.w = 1.0
-    marker.scale.x = marker.scale.y = marker.scale.z = diameter
-    marker.color = tint
+    marker.scale.x, marker.scale.y, marker.scale.z = map(float, np.broadcast_to(size, 3))
+    return marker
+
+
+def line_marker(
+    header: Header,
+    namespace: str,
+    number: int,
+    points: Iterable[Sequence[float] | FloatArray],
+    width: float,
+    tint: ColorRGBA,
+) -> Marker:
+    """Return a marker of a line through points, as `shape_marker`."""
+    marker = Marker(header=header, ns=namespace, id=number, type=Marker.LINE_STRIP, color=tint)
+    marker.pose.orientation.w = 1.0
+    marker.scale.x = width
+    marker.points = [point_to_ros(point) for point in points]
     return marker
 
 
@@ -382,7 +404,7 @@ def filter_markers(
 ) -> MarkerArray:
     """Return markers of clusters (orange, scaled by width) and found targets (green)."""
     markers = [
-        sphere_marker(
+        shape_marker(
             header,
             'clusters',
             number,
@@ -393,7 +415,7 @@ def filter_markers(
         for number, cluster in enumerate(clusters, start=1)
     ]
     tint = colour_of(FOUND)
-    markers += [sphere_marker(header, 'found', t.id, t.position, size, tint) for t in found]
+    markers += [shape_marker(header, 'found', t.id, t.position, size, tint) for t in found]
     return MarkerArray(markers=markers)
 
 

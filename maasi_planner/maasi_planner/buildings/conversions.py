@@ -15,8 +15,10 @@ from maasi_filter.ros.conversions import (
     bounded,
     colour,
     colour_of,
+    line_marker,
     point_from_ros,
     point_to_ros,
+    shape_marker,
 )
 from maasi_msgs.msg import CuboidDecision, SearchLink
 from maasi_msgs.msg import Snapshot as SnapshotMessage
@@ -149,32 +151,18 @@ def agent_markers(
         visited = bool(agent.visited[number])
         tint = colour(0.3, 0.7, 0.9, 0.1) if visited else colour(0.85, 0.4, 0.0, 0.35)
         markers.append(_box(header, f'{name}/cuboids', number, box, tint))
-    robot = _marker(header, f'{name}/robot', Marker.SPHERE, tint_of_robot)
-    robot.pose.position = point_to_ros(agent.position)
-    robot.scale = vector_to_ros(np.full(3, 4.0))
-    line = _marker(header, f'{name}/plan', Marker.LINE_STRIP, tint_of_robot)
-    line.scale.x = 0.8
-    line.points = [point_to_ros(point) for point in plan.positions]
-    arrow = _marker(header, f'{name}/camera', Marker.ARROW, colour(0.9, 0.1, 0.1))
-    arrow.scale.x, arrow.scale.y = 0.8, 2.0
+    robot = shape_marker(header, f'{name}/robot', 0, agent.position, 4.0, tint_of_robot)
+    line = line_marker(header, f'{name}/plan', 0, plan.positions, 0.8, tint_of_robot)
+    ends = []
     if agent.snapshots:
         shot = agent.snapshots[-1]
-        tip = shot.position + shot.distance * shot.direction
-        arrow.points = [point_to_ros(shot.position), point_to_ros(tip)]
-    else:
-        arrow.action = Marker.DELETE
+        ends = [shot.position, shot.position + shot.distance * shot.direction]
+    arrow = line_marker(header, f'{name}/camera', 0, ends, 0.8, colour(0.9, 0.1, 0.1))
+    arrow.type, arrow.scale.y = Marker.ARROW, 2.0
+    arrow.action = Marker.ADD if ends else Marker.DELETE
     return MarkerArray(markers=[*markers, robot, line, arrow])
 
 
-def _marker(header: Header, namespace: str, kind: int, tint: ColorRGBA) -> Marker:
-    marker = Marker(header=header, ns=namespace, type=kind, color=tint)
-    marker.pose.orientation.w = 1.0
-    return marker
-
-
 def _box(header: Header, namespace: str, number: int, box: FloatArray, tint: ColorRGBA) -> Marker:
-    marker = _marker(header, namespace, Marker.CUBE, tint)
-    marker.id = number
-    marker.pose.position = point_to_ros(box.mean(axis=1))
-    marker.scale = vector_to_ros(box[:, 1] - box[:, 0])
-    return marker
+    sides = box[:, 1] - box[:, 0]
+    return shape_marker(header, namespace, number, box.mean(axis=1), sides, tint, Marker.CUBE)

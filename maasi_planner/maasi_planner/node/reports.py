@@ -3,7 +3,7 @@
 from collections.abc import Callable
 
 from maasi_filter.reports import MOST_REPORTS, Report
-from maasi_filter.ros.conversions import report_from_ros
+from maasi_filter.ros.conversions import check_frame, report_from_ros
 from maasi_filter.ros.lifecycle_node import LockstepLifecycleNode
 from maasi_filter.ros.qos import LATCHED_ALL
 from maasi_msgs.msg import Report as ReportMessage
@@ -67,11 +67,7 @@ class Reports:
         for message in due:
             self._used.append(message)
             try:
-                if message.header.frame_id != settings.frame:
-                    raise ValueError(
-                        f'header.frame_id: read {message.header.frame_id!r}, allowed is '
-                        f'{settings.frame!r}'
-                    )
+                check_frame(message.header, settings.frame)
                 self._use(report_from_ros(message, settings.environment.dimension))
             except ValueError as error:
                 self._node.drop('bad report', f'reports.{error}')

@@ -27,7 +27,7 @@ from maasi_filter.ros.conversions import (
     point_to_ros,
     pose_from_ros,
     pose_to_ros,
-    sphere_marker,
+    shape_marker,
 )
 from maasi_filter.ros.qos import LATCHED
 from maasi_msgs.msg import AgentState, RangeArray, RangeMeasurement
@@ -202,11 +202,11 @@ def publish_truth(node: Node, world: World, frame: str) -> None:
     )
     size = 0.01 * float((world.bounds[:, 1] - world.bounds[:, 0]).max())
     shapes = [
-        sphere_marker(header, 'truth', number, target, size, colour(0.0, 0.3, 1.0, 0.7))
+        shape_marker(header, 'truth', number, target, size, colour(0.0, 0.3, 1.0, 0.7))
         for number, target in enumerate(world.targets_3d_at(0), start=1)
     ]
     for number, (*centre, radius, sphere) in enumerate(world.area.solid.tolist(), start=1):
-        shape = sphere_marker(
+        shape = shape_marker(
             header, 'obstacles', number, centre, 2.0 * radius, colour(0.3, 0.3, 0.3)
         )
         if not sphere:
