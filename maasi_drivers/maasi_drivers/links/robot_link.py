@@ -1,6 +1,6 @@
 """The interface between a driver and its robot, which every link implements."""
 
-# Optional hooks do nothing.
+# ruff: noqa: B027 - optional hooks do nothing.
 
 import math
 from abc import ABC, abstractmethod
@@ -10,12 +10,11 @@ from typing import Any
 from maasi_drivers.agent.odometry import StampedPose
 from maasi_drivers.agent.robot_node import RobotNode
 from maasi_drivers.agent.waypoint_follower import Goal
-from maasi_drivers.links.link_hooks import LinkHooks
 from maasi_filter.arrays import FloatArray
 from maasi_planner.motion import MotionModel, RobotState, make_motion
 
 
-class RobotLink(LinkHooks, ABC):
+class RobotLink(ABC):
     """The link to one robot.
 
     A driver creates it in *configure*. The link passes poses to `driver.take_pose`, charges to
@@ -50,10 +49,6 @@ class RobotLink(LinkHooks, ABC):
     def hold(self) -> None:
         """Stop the robot now: its goal was cancelled or its pose is unknown."""
 
-    def hold_step(self, stamp: int) -> None:
-        """Answer the step at `stamp` [ns], whose odometry was unusable, with a stop."""
-        self.hold()
-
     @abstractmethod
     def stop(self) -> None:
         """Stop the robot because the driver ends; may wait for confirmation."""
@@ -86,6 +81,36 @@ class RobotLink(LinkHooks, ABC):
 
     def on_new_goal(self, goal: Goal) -> None:
         """Handle a new goal."""
+
+    # ---- autopilots, Nav2 and the Mambo --------------------------------------------------------
+
+    def expects_pose(self) -> bool:
+        """Return whether to warn about a missing first pose."""
+        return True
+
+    def goal_problem(self, position: Sequence[float]) -> str | None:
+        """Return why a waypoint (x, y, z) [m, map] inside the volume is refused, or None."""
+        return None
+
+    def goal_ended(self, goal: Goal) -> None:
+        """Handle the end of a goal, before its result is sent."""
+
+    def goal_cancelled(self) -> None:
+        """Handle the cancellation of the goal by a client, after `hold`."""
+
+    # ---- robots that a simulation moves in steps -----------------------------------------------
+
+    def begin_step(self, stamp: int) -> None:
+        """Process data older than the step at `stamp` [ns], before its control step."""
+
+    def hold_step(self, stamp: int) -> None:
+        """Answer the step at `stamp` [ns], whose odometry was unusable, with a stop."""
+        self.hold()
+
+    def repeat(self) -> None:
+        """Send the last command again: a restarted peer may have missed it."""
+
+    # ---- motion --------------------------------------------------------------------------------
 
     def make_motion(self) -> MotionModel:
         """Return the controller."""
