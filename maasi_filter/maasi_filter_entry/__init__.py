@@ -27,7 +27,7 @@ def run(target: str, ros: bool = True) -> Any:
         if package.startswith(('ament_', 'rcl')) or package.endswith(
             ('_interfaces', '_msgs', '_srvs')
         ):
-            needed = 'it needs ROS 2 Jazzy and maasi_msgs, built and sourced'
+            needed = 'it needs ROS 2 (Jazzy or Kilted) and maasi_msgs, built and sourced'
         elif package in _OF_EXTRAS:
             needed = 'it comes with an extra of the package'
         else:

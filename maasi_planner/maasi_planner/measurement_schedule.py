@@ -10,6 +10,7 @@ from maasi_filter.models.sensor import Sensor
 from maasi_filter.records import Cluster
 from maasi_filter.unexplored_map import UnexploredMap
 from maasi_planner.motion import MotionModel
+from maasi_planner.objective.sight import probability_over
 from maasi_planner.settings import PlannerSettings
 
 
@@ -24,7 +25,8 @@ def expected_use(
     use = gamma * float(exploration.at(pose.position)[0])
     if clusters:
         centres = np.stack([cluster.position for cluster in clusters])
-        use += float(sum(sensor.detection.probability(centres, pose).tolist()))
+        chances = probability_over(exploration.area, sensor.detection, centres, pose)
+        use += float(sum(chances.tolist()))
     return use
 
 

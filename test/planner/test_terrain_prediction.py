@@ -1,5 +1,7 @@
 """Planners expect what the simulation and the filter see over random terrain, and no more."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from test_tour import fly
@@ -13,12 +15,14 @@ from maasi_filter.models.sensor import Sensor
 from maasi_filter.records import Cluster
 from maasi_filter.unexplored_map import UnexploredMap
 from maasi_planner import MotionSettings, RobotState, RobotView, TeamView, make_motion, make_planner
+from maasi_planner.measurement_schedule import expected_use
 from maasi_planner.objective import information_terms, sight
 from maasi_planner.objective.predicted_measurements import chances, planned_paths, predicted
 from maasi_planner.objective.settings import InformationSettings
 from maasi_planner.objective.sight import SightTables, is_hidden
 from maasi_planner.objective.team_objective import TeamObjective
 from maasi_planner.planners.lattice import Lattice, lanes_of
+from maasi_planner.planners.mutual_information import heading_to, mutual_information
 from maasi_planner.team import UsableCandidates
 
 SIZE = 12.0
@@ -135,6 +139,73 @@ def test_level_terrain_changes_no_decision():
         np.testing.assert_array_equal(*values)
 
 
+def chance_at(team, row_pose, points):
+    """Return pi at points (n, 2) from a pose with its height above the ground."""
+    place = row_pose.position.copy()
+    place[2] += team.area.terrain.height(place)
+    view = team.robots['robot0']
+    pose = Pose(place, row_pose.orientation)
+    return probability_in_sight(view.sensor.detection, points, pose, team.area.terrain)
+
+
+@pytest.mark.parametrize('detection', [BOX, WIDE])
+@pytest.mark.parametrize('seed', range(3))
+def test_terms_of_the_papers_count_only_what_is_in_sight(detection, seed, monkeypatch):
+    """T (19) is a sum of pi at the centres; E (22) leaves what other robots see in sight."""
+    monkeypatch.setattr(sight, 'MOST_BYTES', 0)
+    generator = np.random.default_rng(seed)
+    team = team_over(rough(seed), detection, seed=seed)
+    centres = generator.uniform(1.0, SIZE - 1.0, (8, 2))
+    team.clusters = [Cluster(centre, 0.01 * np.eye(2), 0.1, 0.9) for centre in centres]
+    alone, paths = objective_of(team, objective='paper')
+    view = team.robots['robot0']
+    parked = replace(view, planning=False, state=RobotState.at_rest([6.0, 6.0, 0.7]))
+    team.robots['robot1'] = parked
+    objective, _ = objective_of(team, objective='paper')
+    from_there = Pose.from_yaw(np.array([6.0, 6.0, 0.7]), 0.0)
+    nodes = team.exploration.nodes()
+    hidden = detection.probability(nodes, from_there) > chance_at(team, from_there, nodes)
+    assert hidden.sum() > 10
+    for row, length in enumerate(paths.lengths):
+        poses = [
+            Pose.from_yaw(paths.positions[row, k], paths.yaws[row, k])
+            for k in [*range(7, length, 7), length]
+        ]
+        expected = sum(chance_at(team, pose, centres).sum() for pose in poses)
+        assert objective.alone[row, 0] == pytest.approx(expected, abs=1e-9)
+        assert objective.alone[row, 1] <= alone.alone[row, 1] + 1e-12
+    # One robot that has a node in sight and another node hidden leaves the hidden one as it was.
+    unseen = team.exploration.values.copy()
+    team.exploration.values[...] = np.where(hidden.reshape(unseen.shape), unseen, 0.0)
+    whole = objective_of(replace(team, robots={'robot0': view}), objective='paper')[0]
+    rest = objective_of(team, objective='paper')[0]
+    np.testing.assert_allclose(rest.alone[:, 1], whole.alone[:, 1], rtol=0.02)
+
+
+@pytest.mark.parametrize('seed', range(3))
+def test_planners_of_waypoints_expect_only_what_is_in_sight(seed):
+    team, generator = team_over(rough(seed), seed=seed), np.random.default_rng(seed)
+    centres = generator.uniform(1.0, SIZE - 1.0, (40, 2))
+    team.clusters = [Cluster(centre, 1e-6 * np.eye(2), 0.1, 0.9) for centre in centres]
+    view = team.robots['robot0']
+    poses = [
+        Pose.from_yaw(point, heading_to(view, view.state.pose.position, point))
+        for point in view.candidates
+    ]
+    found = np.array([chance_at(team, pose, centres) for pose in poses])
+    flat = np.array([BOX.probability(centres, pose) for pose in poses])
+    assert (found < flat).any()
+    decision = make_planner('maas').decide(team).robots['robot0']
+    np.testing.assert_allclose(decision.target_refinement, found.sum(axis=1), atol=1e-12)
+    decision = make_planner('mutual_information').decide(team).robots['robot0']
+    weights = np.full(len(centres), 0.9)
+    expected = [mutual_information(1.0 - row, weights) for row in found]
+    np.testing.assert_allclose(decision.target_refinement, expected, rtol=1e-6, atol=1e-9)
+    for pose, row in zip(poses, found):
+        use = expected_use(view.sensor, pose, team.clusters, team.exploration, 0.0)
+        assert use == pytest.approx(row.sum())
+
+
 @pytest.mark.parametrize('seed', range(3))
 def test_potential_targets_behind_hills_are_not_expected_in_sight(seed):
     terrain = rough(seed)
@@ -142,11 +213,10 @@ def test_potential_targets_behind_hills_are_not_expected_in_sight(seed):
     view = team.robots['robot0']
     paths = view.motion.predict(view.state, view.candidates, team.step_time)
     table = SightTables().of(team.exploration, [view])
-    measured = predicted([planned_paths(view, paths, True)], 0, False)
+    measured = predicted([planned_paths(view, paths, True)], 0, False, table)
     points = np.zeros((40, 3))
     points[:, :2] = np.random.default_rng(seed).uniform(0.0, SIZE, (40, 2))
     found = chances(measured, 0, points)
-    sight.remove_hidden(measured, table, 0, points, found)
     for g in range(len(measured.own)):
         for e in range(measured.own[g]):
             place = measured.positions[g, e].copy()

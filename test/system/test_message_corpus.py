@@ -36,7 +36,7 @@ from maasi_msgs.msg import (
 from maasi_sim.run.processes import NodeProcess
 
 ROUNDS = 12
-DRIVERS = ('turtlebot', 'mambo', 'ranging', 'mavlink')
+DRIVERS = ('turtlebot', 'mambo', 'camera', 'ranging', 'mavlink')
 NODES = ('filter', 'planner', 'cuboid_planner', 'guard', 'sim', 'cuboid_sim', *DRIVERS)
 # Nobody plays their sensors at the end.
 CHANGES = {kind: {'sensor_timeout': 0.0, 'odometry_timeout': 0.5} for kind in DRIVERS} | {

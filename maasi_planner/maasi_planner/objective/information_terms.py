@@ -14,12 +14,12 @@ from maasi_planner.objective.predicted_measurements import (
     NEVER,
     Measurements,
     apply_misses,
+    chance_in_sight,
     chances,
     part_of,
     parts_of,
 )
 from maasi_planner.objective.settings import InformationSettings
-from maasi_planner.objective.sight import CLEAR, Sight, layer_of, miss_in_sight, remove_hidden
 from maasi_planner.objective.terms import IndexArray, Terms
 from maasi_planner.team import RobotView, TeamView
 
@@ -69,20 +69,13 @@ def _add_information(
 
 
 def _information(
-    view: RobotView,
-    measured: Measurements,
-    first: int,
-    centres: FloatArray,
-    d: int,
-    sight: Sight = CLEAR,
+    view: RobotView, measured: Measurements, first: int, centres: FloatArray, d: int
 ) -> FloatArray:
     """Return sum pi H' R^-1 H of one robot's measurements from `first` on, (W, C, d, d)."""
     out = np.zeros((len(measured.own), len(centres), d, d))
     lower: FloatArray = np.linalg.cholesky(view.sensor.covariance).astype(float)
     for where, part in parts_of(measured, len(centres)):
         chance = chances(part, first, centres)
-        if sight.hides:
-            remove_hidden(part, sight, layer_of(sight, view.height), centres, chance)
         owner, index, cluster = np.nonzero(chance)
         offsets = (centres[cluster] - part.positions[owner, index])[:, :d]
         # Nearer than the noise of the range, the linear model would be too optimistic.
@@ -126,10 +119,10 @@ def _least_seen(team: TeamView, block: IntArray, middles: FloatArray) -> FloatAr
     return np.asarray(nodes[order[first]].T)
 
 
-def _without(nodes: Nodes, settled: Measurements, sight: Sight, layers: IntArray) -> Nodes:
+def _without(nodes: Nodes, settled: Measurements) -> Nodes:
     """Return the nodes that are still unseen after the measurements of robots that do not plan."""
     unseen = nodes.unseen.copy()
-    counts, node, miss = rows_of(settled, 0, nodes, False, sight, layers)
+    counts, node, miss = rows_of(settled, 0, nodes, False)
     for last, count in zip(counts.cumsum().tolist(), counts.tolist()):
         unseen[node[last - count : last]] *= miss[last - count : last]
     kept = np.flatnonzero(unseen > 0.0)
@@ -178,18 +171,42 @@ def _miss_near(
 
 
 @njit(cache=True)
+def _miss_in_sight(
+    measured: Measurements, g: int, first: int, nodes: Nodes, miss: FloatArray, seen: IndexArray
+) -> int:
+    """Multiply miss (L,) by 1 - pi over terrain; fill and count the changed nodes."""
+    count, reach = 0, measured.reach[measured.robot[g]]
+    shape = nodes.numbers.shape
+    low, high = np.zeros(2, np.int64), np.array(shape[:2])
+    for e in range(first, measured.own[g]):
+        for axis in range(2 if reach < np.inf else 0):
+            begin = (measured.positions[g, e, axis] - nodes.lower[axis]) / nodes.step[axis]
+            width = reach / nodes.step[axis]
+            low[axis] = max(0, np.int64(math.floor(begin - width)))
+            high[axis] = min(shape[axis], np.int64(math.ceil(begin + width)) + 1)
+        cosine, sine = math.cos(measured.yaws[g, e]), math.sin(measured.yaws[g, e])
+        for i in range(low[0], high[0]):
+            for n in nodes.numbers[i, low[1] : high[1], 0]:
+                if n < 0 or miss[n] == 0.0:
+                    continue
+                x, y = nodes.positions[0, n], nodes.positions[1, n]
+                chance = chance_in_sight(measured, g, e, x, y, cosine, sine)
+                if chance > 0.0:
+                    if miss[n] == 1.0:
+                        seen[count] = n
+                        count += 1
+                    miss[n] *= 1.0 - chance
+    return count
+
+
+@njit(cache=True)
 def rows_of(
-    measured: Measurements,
-    first: int,
-    nodes: Nodes,
-    whole: bool,
-    sight: Sight,
-    layers: IntArray,
+    measured: Measurements, first: int, nodes: Nodes, whole: bool
 ) -> tuple[IntArray, IndexArray, FloatArray]:
     """Return the nodes seen by the planned measurements from `first` on, by trajectory.
 
     These are the number of each (G,), the nodes in order, and the product of 1 - pi there (N,).
-    With `whole` each row has all nodes. layers (R,): of robots' heights in `sight`.
+    With `whole` each row has all nodes.
     """
     total, number = measured.own.shape[0], nodes.unseen.shape[0]
     counts, used = np.zeros(total, np.int64), 0
@@ -198,8 +215,8 @@ def rows_of(
     until = np.full(number, NEVER)
     at = nodes.positions[0], nodes.positions[1], nodes.positions[2]
     for g in range(total):
-        if sight.surface.heights.size > 0:
-            count = miss_in_sight(measured, g, first, nodes, miss, seen, sight, layers)
+        if measured.sight.surface.heights.size > 0:
+            count = _miss_in_sight(measured, g, first, nodes, miss, seen)
             seen[:count].sort()
         elif measured.reach[measured.robot[g]] < np.inf:
             count = _miss_near(measured, g, first, nodes, miss, seen)
@@ -234,7 +251,7 @@ class InformationTerms:
     """Terms of the candidates of each robot, then of all of them.
 
     settled: robots whose measurements do not depend on the choice, and these measurements; kinds
-    (R,): kinds of pi of the planning robots; sight: what terrain hides.
+    (R,): kinds of pi of the planning robots.
     """
 
     def __init__(
@@ -243,14 +260,11 @@ class InformationTerms:
         settings: InformationSettings,
         settled: tuple[Sequence[RobotView], Measurements],
         kinds: IntArray,
-        sight: Sight = CLEAR,
     ) -> None:
         self._d = d = team.dimension
-        self._sight = sight
         self._centres = np.zeros((len(team.clusters), 3))
-        layers = np.array([layer_of(sight, view.height) for view in settled[0]], np.int64)
         nodes = _nodes(team, settings, bool((kinds >= BOX).any()))
-        self._nodes = _without(nodes, settled[1], sight, layers)
+        self._nodes = _without(nodes, settled[1])
         for centre, cluster in zip(self._centres, team.clusters):
             centre[:d] = cluster.position[:d]
         self._base = np.zeros((len(self._centres), d, d))
@@ -258,7 +272,7 @@ class InformationTerms:
         for robot, view in enumerate(views):
             begin, end = np.searchsorted(measured.robot, [robot, robot + 1]).tolist()
             part = part_of(measured, begin, end)
-            gains = _information(view, part, 0, self._centres, d, sight)
+            gains = _information(view, part, 0, self._centres, d)
             self._base += gains.sum(axis=0)
         self._mass = np.array([min(1.0, max(0.0, c.mass)) for c in team.clusters], float)
         covariance = np.array([c.covariance[:d, :d] for c in team.clusters], float)
@@ -270,10 +284,8 @@ class InformationTerms:
 
     def of(self, view: RobotView, planned: Measurements, first: int, whole: bool) -> Terms:
         """Return the terms of one robot's candidates for measurements from `first` on."""
-        sight = self._sight
-        layers = np.full(len(planned.kind), layer_of(sight, view.height))
-        counts, node, miss = rows_of(planned, first, self._nodes, whole, sight, layers)
-        gains = _information(view, planned, first, self._centres, self._d, sight)
+        counts, node, miss = rows_of(planned, first, self._nodes, whole)
+        gains = _information(view, planned, first, self._centres, self._d)
         if whole:
             known = np.ones(gains.shape[:2], np.bool_)
         else:

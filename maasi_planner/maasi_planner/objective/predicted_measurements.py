@@ -11,6 +11,7 @@ import numpy as np
 from numba import njit
 
 from maasi_filter.arrays import FloatArray, IntArray
+from maasi_filter.geometry.terrain import hides
 from maasi_filter.models.detection import (
     BOX,
     CUSTOM,
@@ -21,10 +22,13 @@ from maasi_filter.models.detection import (
     fill_probabilities,
 )
 from maasi_planner.motion.base import Trajectories
+from maasi_planner.objective.sight import CLEAR, Sight, is_hidden, layer_of
 from maasi_planner.team import RobotView
 
 NEVER = 1 << 60  # after every measurement [steps]
 MOST_CHANCES = 500_000  # largest part of `chances`
+# Over terrain, share of the best detection below which it is neglected: lines of sight take time.
+NEGLIGIBLE = 0.02
 # x, y and z (n,) [m] in separate arrays, so that loops are vectorised.
 Axes = tuple[FloatArray, FloatArray, FloatArray]
 
@@ -34,8 +38,8 @@ class Measurements(NamedTuple):
 
     Trajectory g of robot[g] has number[g] measurements: own[g] planned ones, and others that only
     other robots expect. times (G, n) [steps from now], positions (G, n, 3) [m], in 2D with z = 0,
-    yaws (G, n) [rad]. For each robot kind (R,) and parameters (R, PARAMETERS) of pi, and its reach
-    (R,) [m].
+    yaws (G, n) [rad]. For each robot kind (R,) and parameters (R, PARAMETERS) of pi, its reach (R,)
+    [m], and the layer (R,) of its height in `sight`, which is what terrain hides.
     """
 
     robot: IntArray
@@ -47,6 +51,8 @@ class Measurements(NamedTuple):
     kind: IntArray
     parameters: FloatArray
     reach: FloatArray
+    layer: IntArray
+    sight: Sight
 
 
 class Paths(NamedTuple):
@@ -143,7 +149,9 @@ def _fill(
                 out.positions[g, i, axis] = path[k, axis]
 
 
-def predicted(robots: Sequence[Paths], horizon: int, extend: bool) -> Measurements:
+def predicted(
+    robots: Sequence[Paths], horizon: int, extend: bool, sight: Sight = CLEAR
+) -> Measurements:
     """Return the measurements of robots on their trajectories.
 
     With `extend` robots continue to measure at their ends until `horizon` (000, section 6: appended
@@ -165,6 +173,8 @@ def predicted(robots: Sequence[Paths], horizon: int, extend: bool) -> Measuremen
         kind=np.array([item.kernel()[0] for item in detections], np.int64),
         parameters=np.array([item.kernel()[1] for item in detections]).reshape(-1, PARAMETERS),
         reach=np.array([reach_of(item) for item in detections], float),
+        layer=np.array([layer_of(sight, paths.view.height) for paths in robots], np.int64),
+        sight=sight,
     )
     row = 0
     for paths, count in zip(robots, counts):
@@ -204,7 +214,7 @@ def parts_of(measured: Measurements, points: int) -> Iterator[tuple[slice, Measu
 @njit(cache=True)
 def chances(measured: Measurements, first: int, points: FloatArray) -> FloatArray:
     """Return pi at points (C, 3) of the planned measurements from `first` on, (G, n, C)."""
-    number = points.shape[0]
+    number, surface = points.shape[0], measured.sight.surface
     out = np.zeros((measured.own.shape[0], measured.times.shape[1], number))
     x, y, z = np.empty((3, number))
     for g in range(out.shape[0]):
@@ -217,7 +227,34 @@ def chances(measured: Measurements, first: int, points: FloatArray) -> FloatArra
                 z[c] = points[c, 2] - measured.positions[g, e, 2]
             cosine, sine = math.cos(measured.yaws[g, e]), math.sin(measured.yaws[g, e])
             fill_probabilities(kind, parameters, x, y, z, cosine, sine, out[g, e])
+            if surface.heights.size == 0:
+                continue
+            height = measured.sight.heights[measured.layer[robot]]
+            at_x, at_y = measured.positions[g, e, 0], measured.positions[g, e, 1]
+            for c in range(number):
+                if out[g, e, c] > 0.0 and hides(
+                    surface, at_x, at_y, height, points[c, 0], points[c, 1]
+                ):
+                    out[g, e, c] = 0.0
     return out
+
+
+@njit(cache=True, error_model='numpy')
+def chance_in_sight(
+    measured: Measurements, g: int, e: int, x: float, y: float, cosine: float, sine: float
+) -> float:
+    """Return pi over terrain at x, y of measurement e of trajectory g, whose heading is given.
+
+    0 if it is negligible.
+    """
+    robot, (x0, y0, _) = measured.robot[g], measured.positions[g, e]
+    parameters = measured.parameters[robot]
+    chance = detection_probability_at(
+        measured.kind[robot], parameters, x - x0, y - y0, 0.0, cosine, sine
+    )
+    if chance <= NEGLIGIBLE * parameters[0]:
+        return 0.0
+    return 0.0 if is_hidden(measured.sight, measured.layer[robot], x0, y0, x, y) else chance
 
 
 @njit(cache=True)
@@ -250,6 +287,13 @@ def apply_misses(
         x0, y0, z0 = measured.positions[g, e]
         if kind >= BOX:
             cosine, sine = math.cos(measured.yaws[g, e]), math.sin(measured.yaws[g, e])
+        if measured.sight.surface.heights.size > 0:
+            for i in range(begin, number):
+                if left[i] > 0.0:
+                    left[i] *= 1.0 - chance_in_sight(
+                        measured, g, e, positions[0][i], positions[1][i], cosine, sine
+                    )
+            continue
         if reach < np.inf:
             for i in range(begin, number):
                 dx, dy = positions[0][i] - x0, positions[1][i] - y0

@@ -1,4 +1,4 @@
-"""Tables of what terrain hides from the robots of a team, filled when they are needed."""
+"""What terrain hides from the robots of a team, in tables that are filled when they are needed."""
 
 from __future__ import annotations
 
@@ -11,15 +11,16 @@ from numba import njit
 from numpy.typing import NDArray
 
 from maasi_filter.arrays import FloatArray, IntArray
+from maasi_filter.geometry.area import Area
 from maasi_filter.geometry.terrain import FLAT, Surface, Terrain, hides
-from maasi_filter.models.detection import detection_probability_at
+from maasi_filter.models.detection import DetectionModel
+from maasi_filter.models.line_of_sight import probability_in_sight
+from maasi_filter.models.pose import Pose
 from maasi_filter.unexplored_map import UnexploredMap, reach_of
 from maasi_planner.team import RobotView
 
 # Largest table, and distances of its robot positions in steps of the map.
 MOST_BYTES, STEPS = 40_000_000, (0.5, 1.0, 2.0)
-# Share of the best detection below which it is neglected: lines of sight take time.
-NEGLIGIBLE = 0.02
 _SEEN, _HIDDEN = 1, 2  # entries; 0: not computed yet
 
 
@@ -39,11 +40,6 @@ class Sight(NamedTuple):
     step: FloatArray = np.ones(2)
     apart: FloatArray = np.ones(2)
     nodes: IntArray = np.zeros(2, np.int64)
-
-    @property
-    def hides(self) -> bool:
-        """Whether there is terrain."""
-        return self.surface.heights.size > 0
 
 
 #: Over flat ground, which hides nothing.
@@ -89,57 +85,6 @@ def _window(sight: Sight, axis: int, position: float, width: int) -> int:
     return min(max(middle - width // 2, 0), sight.nodes[axis] - width)
 
 
-@njit(cache=True)
-def miss_in_sight(measured, g, first, nodes, miss, seen, sight, layers):  # type: ignore[no-untyped-def]
-    """Multiply miss (L,) by 1 - pi in sight of a trajectory; fill and count the changed nodes.
-
-    As `rows_of`, whose nodes and predicted measurements it has.
-    """
-    robot, count = measured.robot[g], 0
-    reach, shape = measured.reach[robot], nodes.numbers.shape
-    kind, parameters = measured.kind[robot], measured.parameters[robot]
-    low, high = np.zeros(2, np.int64), np.array(shape[:2])
-    for e in range(first, measured.own[g]):
-        x, y, _ = measured.positions[g, e]
-        for axis in range(2 if reach < np.inf else 0):
-            begin = (measured.positions[g, e, axis] - nodes.lower[axis]) / nodes.step[axis]
-            width = reach / nodes.step[axis]
-            low[axis] = max(0, np.int64(math.floor(begin - width)))
-            high[axis] = min(shape[axis], np.int64(math.ceil(begin + width)) + 1)
-        cosine, sine = math.cos(measured.yaws[g, e]), math.sin(measured.yaws[g, e])
-        for i in range(low[0], high[0]):
-            for n in nodes.numbers[i, low[1] : high[1], 0]:
-                if n < 0 or miss[n] == 0.0:
-                    continue
-                to_x, to_y = nodes.positions[0, n], nodes.positions[1, n]
-                chance = detection_probability_at(
-                    kind, parameters, to_x - x, to_y - y, 0.0, cosine, sine
-                )
-                if chance <= NEGLIGIBLE * parameters[0]:
-                    continue
-                if is_hidden(sight, layers[robot], x, y, to_x, to_y):
-                    continue
-                if miss[n] == 1.0:
-                    seen[count] = n
-                    count += 1
-                miss[n] *= 1.0 - chance
-    return count
-
-
-@njit(cache=True)
-def remove_hidden(measured, sight, layer, points, chance):  # type: ignore[no-untyped-def]
-    """Set pi (G, n, C) of measurements to 0 at points (C, 3) that are hidden from them."""
-    height = sight.heights[layer]
-    for g in range(chance.shape[0]):
-        for e in range(chance.shape[1]):
-            x, y, _ = measured.positions[g, e]
-            for c in range(chance.shape[2]):
-                if chance[g, e, c] > 0.0 and hides(
-                    sight.surface, x, y, height, points[c, 0], points[c, 1]
-                ):
-                    chance[g, e, c] = 0.0
-
-
 class SightTables:
     """The table of a team, retained as long as terrain, map, heights and sensors are the same."""
 
@@ -182,3 +127,12 @@ def _table(
 def layer_of(sight: Sight, height: float) -> int:
     """Return the index of a height [m] in a table."""
     return int(np.abs(sight.heights - height).argmin())
+
+
+def probability_over(
+    area: Area, detection: DetectionModel, points: FloatArray, pose: Pose
+) -> FloatArray:
+    """Return pi (n,) at points (n, d) for a pose whose height is above the ground."""
+    if area.terrain is not None:
+        pose = Pose(area.above_ground(pose.position), pose.orientation)
+    return probability_in_sight(detection, points, pose, area.terrain)

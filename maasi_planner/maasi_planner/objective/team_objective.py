@@ -58,8 +58,8 @@ class TeamObjective:
         cost = np.concatenate([option.prediction.control_cost for option in choices])
         # By information, later measurements at a robot's end do not count.
         extend = settings.extension == 'measuring' and not informed
-        planned = predicted(paths, int(lengths.max()), extend)
-        settled = predicted(rest, int(lengths.max()), extend)
+        planned = predicted(paths, int(lengths.max()), extend, sight)
+        settled = predicted(rest, int(lengths.max()), extend, sight)
         norm = lengths.astype(float)
         if settings.normalisation == 'distance':
             norm = np.concatenate([option.prediction.distances() for option in choices])
@@ -77,7 +77,7 @@ class TeamObjective:
         )
         if informed:
             others = [path.view for path in rest], settled
-            build = InformationTerms(team, settings, others, planned.kind, sight)
+            build = InformationTerms(team, settings, others, planned.kind)
             self.table, self.alone = self._by_robot(table, build, views, first)
             return
         centres = np.zeros((len(team.clusters), 3))

@@ -15,6 +15,7 @@ from pydantic import Field
 
 from maasi_filter.arrays import FloatArray
 from maasi_filter.models.pose import Pose
+from maasi_planner.objective.sight import probability_over
 from maasi_planner.planners.base import Planner, explain
 from maasi_planner.planners.joint_choice import search_jointly
 from maasi_planner.planners.mutual_information import heading_to, intensity, mutual_information
@@ -116,7 +117,7 @@ class Sequences:
                 key = positions[row, j].tobytes() + np.float64(yaw).tobytes()
                 if key not in known:
                     pose = Pose.from_yaw(positions[row, j], yaw)
-                    known[key] = view.sensor.detection.probability(points, pose)
+                    known[key] = probability_over(team.area, view.sensor.detection, points, pose)
                 if informed:
                     missed *= 1.0 - known[key]
                 else:

@@ -18,6 +18,7 @@ from numba import njit
 
 from maasi_filter.arrays import FloatArray
 from maasi_filter.models.pose import Pose
+from maasi_planner.objective.sight import probability_over
 from maasi_planner.planners.base import Planner, explain
 from maasi_planner.planners.joint_choice import search_jointly
 from maasi_planner.planners.options import usable_options
@@ -143,7 +144,7 @@ class MutualInformation(Planner):
         options = usable_options(team, decision)
         particles, weights = intensity(team)
         missed = {
-            name: self._missed(team.robots[name], option.points, particles)
+            name: self._missed(team, team.robots[name], option.points, particles)
             for name, option in options.items()
         }
 
@@ -190,11 +191,13 @@ class MutualInformation(Planner):
         return explain(decision)
 
     @staticmethod
-    def _missed(view: RobotView, positions: FloatArray, points: FloatArray) -> FloatArray:
+    def _missed(
+        team: TeamView, view: RobotView, positions: FloatArray, points: FloatArray
+    ) -> FloatArray:
         here = np.array(view.state.pose.position)
         out = np.ones((len(positions), len(points)))
         if len(points):
             for row, point in zip(out, positions):
                 pose = Pose.from_yaw(point, heading_to(view, here, point))
-                row[:] = 1.0 - view.sensor.detection.probability(points, pose)
+                row[:] = 1.0 - probability_over(team.area, view.sensor.detection, points, pose)
         return out
