@@ -123,9 +123,10 @@ def report(recorded: RecordedRobot, noise: SensorNoise, given: bool) -> str:
         f'{recorded.robot or "/"}: {noise.used} {recorded.use} used, at {noise.ranges[0]:.2f} to '
         f'{noise.ranges[1]:.2f} m{poses}',
         f'target at {position} m, ' + ('as given' if given else 'the mean of its detections'),
-        f'skipped: {noise.near} from too close, {noise.others} detections of other objects, '
+        f'skipped: {noise.near} from too close, {noise.others} of other objects, '
         f'{recorded.left_out} without a pose or unusable',
-        f'in the field of view {noise.inside} times, missed {noise.missed} times',
+        f'images with the target in the field of view: {noise.inside}, without a detection: '
+        f'{noise.missed}',
     ]
     for name, unit, deviation, bias in zip(names, units, noise.deviations, noise.bias):
         clear = given and abs(bias) > _CLEAR * deviation / np.sqrt(noise.used)

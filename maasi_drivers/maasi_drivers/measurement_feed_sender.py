@@ -13,7 +13,7 @@ from maasi_drivers.settings.camera import SegmentationSettings
 from maasi_drivers.vision.images import ImageSourceError, VideoSource
 from maasi_drivers.vision.measurement_feed import MOST, FeedPacket, encode
 from maasi_drivers.vision.segmentation import segment
-from maasi_filter.wording import problems
+from maasi_filter.wording import counted, problems
 
 _ROUND = 0.002
 
@@ -87,7 +87,7 @@ def main(arguments: list[str] | None = None) -> int:
             output.sendto(encode(packet), (host, int(port)))
             sent += 1
     source.close()
-    print(f'{sent} images sent to {options.to}')
+    print(f'{counted(sent, "image")} sent to {options.to}')
     return 0
 
 

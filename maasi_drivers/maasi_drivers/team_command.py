@@ -173,7 +173,7 @@ class _Robot:
         at, frame = state.pose.pose.position, state.header.frame_id
         goal = _STATUS.get(state.goal_status, 'unknown')
         reason = f': {state.reason}' if state.reason else ''
-        battery = f'{state.battery:.0%}' if state.battery >= 0.0 else 'unknown'
+        battery = f'{100.0 * state.battery:.0f} %' if state.battery >= 0.0 else 'unknown'
         print(
             f'{state.robot}: {goal}{reason}; at ({at.x:.3f}, {at.y:.3f}, {at.z:.3f}) m in {frame}, '
             f'battery {battery}'

@@ -130,11 +130,12 @@ class _Search:
                 group.coordinator.robots[name].clear_plan()
             for robot in self._here.values():
                 robot.observe(round(self.time * 1e9))
-            self.log.add_states(self.time, {name: r.state for name, r in self._here.items()})
             commands = {
                 name: robot.follower.update(robot.state, self.step)[0]
                 for name, robot in self._here.items()
             }
+            states = {name: robot.shown() for name, robot in self._here.items()}
+            self.log.add_states(self.time, states)
             for group in self._groups:
                 present = self._plan(group)
                 self._measure(group, present)
@@ -284,6 +285,10 @@ class _Robot:
         motion = reading.velocity, reading.angular_velocity
         self.pose = self.odometry.apply(stamp, reading.pose, reading.covariance, *motion)
         self.state = RobotState(self.pose.pose, self.pose.velocity, self.pose.angular_velocity)
+
+    def shown(self) -> tuple[RobotState, float, int]:
+        """Return its state, the charge of its battery, and the status of its goal."""
+        return self.state, float(self.body.battery.charge), int(self.follower.status)
 
     def measure(self, step: int, time: float, index: int) -> AgentMeasurement:
         if self.detector is None:

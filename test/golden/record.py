@@ -11,6 +11,7 @@ from typing import Any
 
 from golden_runs import Recording, runs
 
+from maasi_filter.wording import counted
 from maasi_sim.machine import machine_difference, this_machine
 
 FOLDER = Path(__file__).resolve().parent / 'stored'
@@ -173,7 +174,7 @@ def main(arguments: list[str] | None = None) -> int:
     number = sum(len(item) for item in made.values())
     how = ', to the bit' if options.against else ''
     spent = time.monotonic() - begin
-    print(f'{number} runs in {spent:.0f} s{how}: {len(found)} differences')
+    print(f'{counted(number, "run")} in {spent:.0f} s{how}: {counted(len(found), "difference")}')
     if options.save:
         write(options.save, made)
     if options.write:

@@ -9,6 +9,7 @@ from rclpy.action import ActionServer, CancelResponse, GoalResponse
 from rclpy.task import Future
 
 from maasi_filter.ros.lifecycle_node import LockstepLifecycleNode
+from maasi_filter.wording import counted
 from maasi_msgs.action import SearchTargets
 from maasi_planner.node.search_modes import COMMANDS
 
@@ -55,7 +56,7 @@ class SearchAction:
         if goal.is_cancel_requested:
             end = Result.CANCELED, 'cancelled'
         elif request.targets and feedback.found >= request.targets:
-            end = Result.TARGETS_FOUND, f'{feedback.found} targets found'
+            end = Result.TARGETS_FOUND, f'{counted(feedback.found, "target")} found'
         elif finished:
             end = Result.DONE, finished
         elif 0.0 < request.time_limit <= time - self._began:

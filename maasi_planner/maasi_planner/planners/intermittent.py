@@ -4,6 +4,7 @@ from numba import njit
 
 from maasi_filter.arrays import BoolArray, FloatArray
 from maasi_filter.geometry.area import Area
+from maasi_filter.wording import counted
 from maasi_planner.motion.base import Trajectories
 from maasi_planner.objective.joint_search import PAIRS_LIMIT, search
 from maasi_planner.objective.predicted_measurements import CoarseTrajectories
@@ -70,7 +71,8 @@ class Intermittent(Planner):
             seconds = option.prediction.lengths[best] * team.step_time
             reason = (
                 f'arrives in {seconds:.3g} s; J = {value:.3g} is the best of '
-                f'{len(option.points)} candidates, with target refinement T = {refinement:.3g} and '
+                f'{counted(len(option.points), "candidate")}, with target refinement '
+                f'T = {refinement:.3g} and '
                 f'exploration E = {exploration:.3g}'
             )
             result = single_choice(option.points, option.prediction, best, reason)

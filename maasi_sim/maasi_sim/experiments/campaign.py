@@ -14,6 +14,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Any, TypeVar
 
+from maasi_filter.wording import counted
 from maasi_sim.arguments import count
 from maasi_sim.experiments.experiment import Case, Experiment, Outcome, Results, Run, WrongInput
 from maasi_sim.experiments.runs import DamagedRun, NoRoom, load_run, run_of, to_text, write_file
@@ -306,11 +307,13 @@ def carry_out_all(
         left = (time.monotonic() - begin) * (number - made) / made
         what = f'{task.experiment} {task.case.name}'
         what += f', case {cases.index(what) + 1} of {len(cases)}'
-        display.show(f'{made} of {number} runs, about {left:.0f} s left ({what})', 0)
+        display.show(f'{made} of {counted(number, "run")}, about {left:.0f} s left ({what})', 0)
 
     try:
         if number:
-            display.update(f'0 of {number} runs, of {len(cases)} cases', quiet=True)
+            display.update(
+                f'0 of {counted(number, "run")}, of {counted(len(cases), "case")}', quiet=True
+            )
             team = make_workers(number, workers, cluster)
         machine = one_machine(team, campaigns) if number and not mixed else None
         for work in campaigns:
@@ -321,9 +324,13 @@ def carry_out_all(
     finally:
         display.close()
         team.close()
-    used = f' by {team.number} workers in {time.monotonic() - begin:.0f} s' if number else ''
+    used = (
+        f' by {counted(team.number, "worker")} in {time.monotonic() - begin:.0f} s'
+        if number
+        else ''
+    )
     kept = sum(len(work.done) for work in campaigns)
-    print(f'{number - len(problems)} runs made{used}; {kept} there in all')
+    print(f'{counted(number - len(problems), "run")} made{used}; {kept} stored in all')
     for problem in problems:
         print(f'error: {problem}', file=sys.stderr)
     return problems

@@ -5,6 +5,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from maasi_filter.wording import counted
 from maasi_sim.arguments import Parser, count, whole
 from maasi_sim.experiments.campaign import (
     DONE,
@@ -99,7 +100,7 @@ def _reproduce(options: argparse.Namespace) -> int:
     if options.document is not None:
         settings = options.seed, options.small, options.rewrite
         shown = write_document(options.document, options.out, *settings)
-        print(f'wrote {options.document} with {len(shown)} experiments')
+        print(f'wrote {options.document} with {counted(len(shown), "experiment")}')
     return SOME_FAILED if problems else DONE
 
 
@@ -107,8 +108,9 @@ def _line(item: Experiment) -> str:
     cases = item.cases(False)
     runs = sum(item.runs if case.runs is None else case.runs for case in cases)
     minutes = runs * item.seconds / 60.0
-    takes = f'{len(cases)} cases, {runs} runs, {max(minutes, 0.1):.1f} min on a core'
-    return f'{item.name:12s} {takes:38s} {item.title}'
+    work = f'{counted(len(cases), "case")}, {counted(runs, "run")}'
+    takes = f'{work}, {max(minutes, 0.1):.1f} min on a core'
+    return f'{item.name:14s} {takes:39s} {item.title}'
 
 
 def _run(wanted: Sequence[Experiment], options: argparse.Namespace) -> list[str]:

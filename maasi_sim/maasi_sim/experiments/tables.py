@@ -9,7 +9,7 @@ import numpy as np
 from scipy import stats
 
 from maasi_filter.arrays import FloatArray
-from maasi_filter.wording import number
+from maasi_filter.wording import counted, number
 from maasi_sim.experiments.experiment import Quantity, Results, plain
 from maasi_sim.experiments.runs import csv_text
 from maasi_sim.experiments.statistics import (
@@ -90,7 +90,7 @@ class Row:
         if self.quantity.kind == 'restricted' and self.runs > 2 and math.isfinite(self.median):
             text += f' (median {number(self.median)})'
         if 0 < self.finished < self.runs:
-            text += f', {self.finished} runs'
+            text += f', {counted(self.finished, "run")}'
         if self.paper is not None:
             note = f' ({self.note})' if self.note else ''
             text += f'<br>paper {shown(self.paper)}{note}'

@@ -278,13 +278,13 @@ class RunLog(RunRecord):
             case facts.Updated():
                 self._count(fact)
 
-    def add_states(self, time: float, states: Mapping[str, RobotState]) -> None:
-        """Add robot states, at the rate of the page."""
+    def add_states(self, time: float, states: Mapping[str, tuple[RobotState, float, int]]) -> None:
+        """Add states of robots, with charges and goal statuses, at the rate of the page."""
         if time - self._last_states >= STATE_PERIOD - 1e-9:
             self._last_states = time
-            for name, state in states.items():
+            for name, (state, charge, status) in states.items():
                 pose = (*state.pose.position.tolist(), float(state.pose.yaw))
-                self.add(facts.RobotAt(time, name, pose))
+                self.add(facts.RobotAt(time, name, pose, charge, status))
 
     def add_map(self, time: float, team: str, exploration: UnexploredMap, now: bool) -> None:
         """Add an exploration function as a planner node does: once per second, and if `now`."""

@@ -317,11 +317,10 @@ def _feed(
     if first_difference is not None:
         print(f'the first difference is in the update for batch {first_difference}')
     number = sum(len(item.targets) for item in found.values())
+    count = len(recording.batches)
+    batches = f'{count} batch' if count == 1 else f'{count} batches'
     if lines:
-        print(f'{len(recording.batches)} batches replayed: the found targets differ')
+        print(f'{batches} replayed: the found targets differ')
         return DIFFERENT
-    print(
-        f'{len(recording.batches)} batches replayed: {counted(number, "found target")}, '
-        'bit-identical'
-    )
+    print(f'{batches} replayed: {counted(number, "found target")}, bit-identical')
     return EQUAL

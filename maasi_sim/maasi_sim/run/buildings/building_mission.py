@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from rosbags.typesys.store import Typestore
 
 from maasi_filter.ros.parameters import flatten
-from maasi_filter.wording import number, point
+from maasi_filter.wording import counted, number, point
 from maasi_planner.buildings.settings import CuboidPlannerSettings
 from maasi_sim.run.buildings.observer import (
     CuboidObserver,
@@ -48,7 +48,7 @@ class BuildingMission(Mission[CuboidRecord]):
         cuboids = len(scenario.mission().cells)
         return Preflight(
             [
-                f'space: {" x ".join(map(number, sides))} m, {cuboids} cuboids to visit',
+                f'space: {" x ".join(map(number, sides))} m, {counted(cuboids, "cuboid")} to visit',
                 *starts,
                 f'the time limit is {number(scenario.limits.time)} s',
             ]

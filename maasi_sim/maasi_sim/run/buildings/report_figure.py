@@ -8,7 +8,7 @@ from matplotlib.patches import Rectangle
 
 from maasi_filter.arrays import FloatArray
 from maasi_filter.colours import robot_colours
-from maasi_filter.wording import number
+from maasi_filter.wording import counted, number
 from maasi_sim.run.buildings.observer import CuboidRecord, build_cuboid_report
 from maasi_sim.run.buildings.picture import OBJECT, OBSTACLE, OPEN, VISITED
 from maasi_sim.run.report_files import reason_of_end
@@ -96,6 +96,6 @@ def _rows(record: CuboidRecord) -> list[tuple[str, str]]:
         ('all visited after', '-' if complete is None else f'{complete:.0f} s'),
         ('smallest p_d', '-' if least is None else f'{number(least)} of a snapshot'),
         ('collisions', str(report['collisions'])),
-        *((key, f'{number} decisions') for key, number in report['choices'].items()),
+        *((key, counted(count, 'decision')) for key, count in report['choices'].items()),
         ('ended', f'{reason_of_end(report)}, at {record.end_time:.1f} s'),
     ]

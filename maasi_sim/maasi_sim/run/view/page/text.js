@@ -12,7 +12,7 @@ export function number(value, padded = false) {
   if (value === null || value === undefined || Number.isNaN(value)) return '-';
   if (Number.isInteger(value)) return String(value);
   const size = Math.abs(value);
-  if (size < 1e-3 || size >= 1e5) return value.toExponential(2);
+  if (size < 1e-5 || size >= 1e5) return value.toExponential(2);
   const digits = value.toPrecision(3);
   return padded && !digits.includes('e') ? digits : String(Number(digits));
 }

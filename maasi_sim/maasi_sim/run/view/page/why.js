@@ -57,12 +57,15 @@ export function expectation(log, candidates, chosen) {
   if (objective !== 'information' || !weights) {
     return `has the ${gain.J > 0 ? 'larger' : 'smaller'} objective: J ${number(own[6])}, next best ${number(other[6])}`;
   }
-  // The term with the larger part.
-  const explores = weights.beta * own[5] >= weights.alpha * own[4];
-  const [term, what] = explores ? [5, 'new targets'] : [4, 'nats of information on potential targets'];
   // J is per step: a longer path needs more.
-  const [here, there] = own[7] === other[7] ? ['', ''] : [` of ${counted(own[7], 'step')}`, ` on ${counted(other[7], 'step')}`];
-  return `expects ${number(own[term])} ${what} on this path${here}, next best ${number(other[term])}${there}`;
+  const seconds = (item) => `${number(item[7] * log.scene.step)} s`;
+  const [here, there] = own[7] === other[7] ? ['', ''] : [` of ${seconds(own)}`, ` of ${seconds(other)}`];
+  // The term with the larger part.
+  if (weights.beta * own[5] >= weights.alpha * own[4]) {
+    return `expects ${number(own[5])} new targets on this path${here}, and ${number(other[5])} on the next best${there}`;
+  }
+  if (!(other[4] > 0)) return `expects information on potential targets on this path${here}, and none on the next best${there}`;
+  return `expects ${number(own[4] / other[4])} times as much information on potential targets on this path${here} as on the next best${there}`;
 }
 
 export function showWhy(parent, log, time, selected, marked, onMark) {
