@@ -190,13 +190,9 @@ def fit_speed(legs: list[Leg], tilt: float) -> MeasuredSpeed:
 
 
 def _travelled(model: TiltModel, tilts: list[tuple[float, float]], passed: float) -> float:
+    commands = [(begin, np.array([share, 0.0, 0.0, 0.0])) for begin, share in tilts]
     course = Course(np.zeros(3), np.zeros(3), 0.0)
-    ends = [begin for begin, _ in tilts[1:]] + [math.inf]
-    for (begin, share), end in zip(tilts, ends, strict=True):
-        h = min(passed, end) - begin
-        if h > 0.0:
-            course = model.advance(course, np.array([share, 0.0, 0.0, 0.0]), h)
-    return float(course.position[0])
+    return float(model.follow(course, commands, -math.inf, passed).position[0])
 
 
 # Lowest and highest value by option.

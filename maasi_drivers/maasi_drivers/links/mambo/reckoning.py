@@ -8,6 +8,7 @@ at the largest tilt. A command acts after a delay.
 
 import math
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -76,6 +77,22 @@ class TiltModel:
             steady + decay * lag,
             course.yaw + h * self.turn * turn,
         )
+
+    def follow(
+        self,
+        course: Course,
+        commands: Sequence[tuple[float, FloatArray]],
+        begin: float,
+        end: float,
+        push: FloatArray = _STILL_AIR,
+    ) -> Course:
+        """Return the course at `end` [s], under commands that act each from a time on."""
+        ends = [acts for acts, _ in commands[1:]] + [math.inf]
+        for (acts, shares), until in zip(commands, ends, strict=True):
+            h = min(until, end) - max(acts, begin)
+            if h > 0.0:
+                course = self.advance(course, shares, h, push)
+        return course
 
 
 # Weight of an event's difference in position and velocity.
@@ -157,13 +174,7 @@ class DeadReckoning:
         return self._fly(self.course, self._now, self._now + self.settings.delay)
 
     def _fly(self, course: Course, begin: float, end: float) -> Course:
-        sent = list(self._sent)
-        ends = [acts for acts, _ in sent[1:]] + [math.inf]
-        for (acts, shares), until in zip(sent, ends, strict=True):
-            h = min(until, end) - max(acts, begin)
-            if h > 0.0:
-                course = self.model.advance(course, shares, h, self.push)
-        return course
+        return self.model.follow(course, list(self._sent), begin, end, self.push)
 
     def update(self, state: RobotState, now: float, flying: bool) -> None:
         """Correct by the pose of another system at `now`."""
