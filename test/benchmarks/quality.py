@@ -13,12 +13,19 @@ import os
 import sys
 from functools import partial
 from pathlib import Path
-from unittest.mock import patch
 
 import numpy as np
 import reference_quality
 import reflection_quality
-from quality_conditions import CONDITIONS, DEGREES, RETURNS, SCENARIOS, changed, wanted
+from quality_conditions import (
+    CONDITIONS,
+    DEGREES,
+    RETURNS,
+    SCENARIOS,
+    changed,
+    wanted,
+    with_returns,
+)
 from scipy.stats import binomtest, chi2
 
 from maasi_filter import warm_up
@@ -27,7 +34,6 @@ from maasi_sim.experiments.campaign import make_workers, run_command
 from maasi_sim.experiments.statistics import mean_interval, paired_difference
 from maasi_sim.experiments.tables import markdown_table
 from maasi_sim.search import search
-from maasi_sim.simulation.sensors import RangingSensor
 
 METHODS = ('ic_phd', 'pmb')
 OTHERS = {'reference': reference_quality, 'reflections': reflection_quality}
@@ -54,13 +60,7 @@ def run_one(key, settings=None):
     """Run a search of a condition, method and seed; return counts, sums of errors and times."""
     condition, method, seed = key
     scenario = prepared(condition, method, seed, settings)
-    measure = RangingSensor.measure
-    with_further = RETURNS.get(condition, lambda sensor, pose, step, *seen: seen)
-
-    def returned(sensor, pose, step, *rest):
-        return with_further(sensor, pose, step, *measure(sensor, pose, step, *rest))
-
-    with patch.object(RangingSensor, 'measure', returned):
+    with with_returns(RETURNS.get(condition, lambda sensor, pose, step, *seen: seen)):
         result = search(scenario, seed, CAP_OF_IMAGES if condition in SCENARIOS else CAP)
     match = result.scores.match
     normalised = sum(

@@ -2,6 +2,7 @@
 
 import math
 import os
+from unittest.mock import patch
 
 import numpy as np
 
@@ -9,6 +10,7 @@ from maasi_filter import NoiseSettings
 from maasi_sim.scenario.layering import merged
 from maasi_sim.scenario.loading import load_scenario
 from maasi_sim.scenario.schema import Scenario
+from maasi_sim.simulation.sensors import RangingSensor
 from maasi_sim.simulation.world import noise_stream
 
 # What is tuned is tuned on the first block and looked at again on the second; the third is for
@@ -83,6 +85,16 @@ def copies(robot, name, *layers):
 # Further returns of sensors: these are called with what `RangingSensor.measure` has returned.
 
 
+def with_returns(change):
+    """Return a context in which sensors return what `change` makes of their measurements."""
+    measure = RangingSensor.measure
+
+    def returned(sensor, pose, step, *rest):
+        return change(sensor, pose, step, *measure(sensor, pose, step, *rest))
+
+    return patch.object(RangingSensor, 'measure', returned)
+
+
 def duplicates(sensor, pose, step, values, causes):
     """One in five detections comes twice, 0.3 of the noise's deviations apart."""
     generator = noise_stream(sensor.seed, sensor.robot, step, 'duplicates')
@@ -92,12 +104,13 @@ def duplicates(sensor, pose, step, values, causes):
     return np.concatenate([values, twice]), np.concatenate([causes, causes[again]])
 
 
-def reflections(sensor, pose, step, values, causes):
-    """Five fixed places without a target return with 0.3 of pi."""
-    at = np.random.default_rng([sensor.seed, 78]).uniform(10.0, SIDE - 10.0, (5, 3))
+def reflections(sensor, pose, step, values, causes, number=5, low=10.0, high=SIDE - 10.0):
+    """Fixed places without a target return with 0.3 of pi."""
+    shape = number, values.shape[1]
+    at = np.random.default_rng([sensor.seed, 78]).uniform(low, high, shape)
     generator = noise_stream(sensor.seed, sensor.robot, step, 'reflections')
-    seen = generator.random(5) < 0.3 * sensor.sensor.detection.probability(at, pose)
-    errors = generator.standard_normal((5, 3)) @ sensor._spread.T
+    seen = generator.random(number) < 0.3 * sensor.sensor.detection.probability(at, pose)
+    errors = generator.standard_normal(shape) @ sensor._spread.T
     returns = (sensor.sensor.measurement.measure(at, pose) + errors)[seen]
     return np.concatenate([values, returns]), np.append(causes, np.full(len(returns), -1))
 

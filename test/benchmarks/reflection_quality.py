@@ -3,15 +3,12 @@
 Each reflection is a fixed position without a target that answers with 0.3 of pi.
 """
 
-from unittest.mock import patch
-
 import numpy as np
+from quality_conditions import reflections, with_returns
 from search_quality import prepared
 
 from maasi_sim.experiments.campaign import make_workers
 from maasi_sim.search import search
-from maasi_sim.simulation.sensors import RangingSensor
-from maasi_sim.simulation.world import noise_stream
 
 # By name: regime, planner, and number of reflections.
 CONDITIONS = {
@@ -26,7 +23,6 @@ HEAD = (
     *('condition', 'runs', 'complete', 'targets left'),
     *('left, detected in half of five looks or more', 'reflections found'),
 )
-ANSWERS = 0.3  # share of pi
 MARGIN = 0.05  # of the side of the area, without reflections
 LEAST_LOOKS, LEAST_DETECTED = 5, 0.5
 
@@ -35,25 +31,18 @@ def run_one(key):
     """Return whether all was found, and the numbers of the table; key: seed and case."""
     seed, (regime, kind, number) = key
     scenario = prepared(regime, kind)
-    measure, counts = RangingSensor.measure, {}
+    counts = {}
 
-    def returned(sensor, pose, step, *rest):
-        values, causes = measure(sensor, pose, step, *rest)
-        d, model = values.shape[1], sensor.sensor
-        detection, targets = model.detection, sensor.targets[:, : values.shape[1]]
+    def returned(sensor, pose, step, values, causes):
+        detection, targets = sensor.sensor.detection, sensor.targets[:, : values.shape[1]]
         looks, detected = counts.setdefault('all', np.zeros((2, len(targets))))
         looks += detection.probability(targets, pose) > 0.5 * detection.gain
         np.add.at(detected, causes[causes >= 0], 1.0)
         low, high = sensor.bounds.T
-        edge = MARGIN * (high - low)
-        at = np.random.default_rng([sensor.seed, 78]).uniform(low + edge, high - edge, (number, d))
-        generator = noise_stream(sensor.seed, sensor.robot, step, 'reflections')
-        seen = generator.random(number) < ANSWERS * detection.probability(at, pose)
-        errors = generator.standard_normal((number, d)) @ np.linalg.cholesky(model.covariance).T
-        returns = (model.measurement.measure(at, pose) + errors)[seen]
-        return np.concatenate([values, returns]), np.append(causes, np.full(len(returns), -1))
+        low, high = low + MARGIN * (high - low), high - MARGIN * (high - low)
+        return reflections(sensor, pose, step, values, causes, number, low, high)
 
-    with patch.object(RangingSensor, 'measure', returned):
+    with with_returns(returned):
         result = search(scenario, seed)
     match = result.scores.match
     looks, detected = counts['all']
