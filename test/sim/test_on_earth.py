@@ -98,7 +98,7 @@ def test_points_of_the_area_are_starts_and_chargers(tmp_path):
         ),
         (
             {'latitude': 9.9, 'longitude': 46.6},
-            r'4,739 km outside of the area: .* swapped',
+            r'latitude 9\.900000, longitude 46\.600000, 4,739 km outside of the area: .* swapped',
         ),
     ],
 )

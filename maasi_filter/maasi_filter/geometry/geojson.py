@@ -17,7 +17,7 @@ from shapely.geometry.base import BaseGeometry
 
 from maasi_filter.arrays import FloatArray
 from maasi_filter.geometry.geodesy import OriginSettings, to_map
-from maasi_filter.geometry.map_files import LABEL, READERS, read_map_file
+from maasi_filter.geometry.map_files import LABEL, READERS, read_map_file, text_of
 from maasi_filter.geometry.polygons import is_wkt, short, sound, warn
 from maasi_filter.geometry.vector_files import VECTOR_FILES, read_vector_file
 
@@ -233,11 +233,10 @@ def _parsed(value: Any, named: bool) -> Any:
     if named and Path(value).suffix.lower() in VECTOR_FILES:
         return read_vector_file(value)
     try:
-        # Some programs begin a file with a byte order mark.
-        return json.loads(Path(value).read_text(encoding='utf-8-sig') if named else value)
+        return json.loads(text_of(Path(value).read_bytes()) if named else value)
     except OSError as error:
         raise ValueError(f'{value}: {error.strerror}') from None
-    except UnicodeDecodeError:
+    except UnicodeError:
         raise ValueError(f'{value}: is not UTF-8 text') from None
     except (ValueError, RecursionError) as error:
         line = f' in line {error.lineno}' if isinstance(error, json.JSONDecodeError) else ''
@@ -340,7 +339,9 @@ def _short_way(rings: Sequence[FloatArray], where: str) -> list[FloatArray]:
     if not any((np.abs(np.diff(ring[:, 0])) > 180.0).any() for ring in rings):
         return list(rings)
     warn(f'{where}: has edges longer than 180 degrees: read as an area across 180 degrees')
-    east = [np.unwrap(ring[:, 0], period=360.0) for ring in rings]
+    # By whole turns, as other sums would be rounded, and rings end where they begin.
+    turned = [np.round(np.diff(ring[:, 0], prepend=ring[0, 0]) / 360.0).cumsum() for ring in rings]
+    east = [ring[:, 0] - 360.0 * turn for ring, turn in zip(rings, turned)]
     turns = [np.round((axis.mean() - east[0].mean()) / 360.0) for axis in east]
     columns = zip(east, turns, rings)
     return [np.column_stack([x - 360.0 * turn, ring[:, 1]]) for x, turn, ring in columns]

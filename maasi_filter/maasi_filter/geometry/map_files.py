@@ -5,6 +5,7 @@ KML, KMZ, GPX, QGroundControl `.plan`, Mission Planner `.poly` and `.waypoints`.
 
 from __future__ import annotations
 
+import codecs
 import io
 import json
 import lzma
@@ -21,6 +22,8 @@ from xml.etree.ElementTree import Element, TreeBuilder
 from xml.parsers import expat
 
 import numpy as np
+import shapely
+from shapely.geometry import Polygon
 
 from maasi_filter.geometry.geodesy import OriginSettings, geodetic
 from maasi_filter.geometry.polygons import short
@@ -33,11 +36,15 @@ MOST_BYTES = 20_000_000  # of a file, and of the KML in a KMZ
 MOST_ELEMENTS = 1_000_000  # of XML
 _CORNERS = 64  # of the polygon of a circle
 _GAP = 0.05  # most between the ends of a closed track, relative to its length
+_LOOPS = 0.05  # most of a track's area in small loops where it crosses itself
 _DEGREE = 111_195.0  # of latitude [m]
 # Beginnings of names, and of names of KML folders, that are a role.
 _POLYGON_WORDS = {'keep_out': r'keep[-_ ]?outs?|no[-_ ]?(?:fly|go)', 'prior': 'prior'}
 _POINT_WORDS = {'start': 'starts?', 'home': 'home', 'charger': 'chargers?'}
 _KML_SHAPES = ('Polygon', 'LinearRing', 'LineString', 'Point', 'Model', 'Track', 'MultiTrack')
+# The encoding in the declaration of XML, and those of texts.
+_DECLARED = re.compile(rb'\s*<\?xml[^>]*\sencoding\s*=\s*["\']([\w.:-]+)')
+_ENCODINGS = re.compile(r'(utf|iso|latin|windows|cp|koi8|mac|gb|big5|shift|euc)[\w-]*$')
 _RING = '%sBoundaryIs/LinearRing'
 _KML_OTHERS = ('NetworkLink', 'GroundOverlay', 'ScreenOverlay', 'PhotoOverlay', 'Tour')
 # Fence commands of MAVLink.
@@ -63,6 +70,17 @@ def read_map_file(path: str) -> Row:
     except ValueError as error:
         raise ValueError(f'{path}: {error}') from None
     return {'type': 'FeatureCollection', 'features': rows}
+
+
+def encoding_of(data: bytes) -> str:
+    """Return the encoding of text as its byte order mark says, or else UTF-8."""
+    marks = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
+    return 'utf-16' if data.startswith(marks) else 'utf-8-sig'
+
+
+def text_of(data: bytes) -> str:
+    """Return text as its byte order mark says, or in UTF-8; UnicodeError if it is not."""
+    return data.decode(encoding_of(data))
 
 
 def check_size(data: bytes) -> None:
@@ -118,7 +136,8 @@ def polygons_row(
 
 def _xml(data: bytes, root: str) -> Element:
     """Return the root of XML: tags without namespaces, each with its `line`."""
-    builder, parser, count = TreeBuilder(), expat.ParserCreate(namespace_separator=' '), 0
+    # Without namespaces, as files often use prefixes that they do not declare.
+    builder, parser, count = TreeBuilder(), expat.ParserCreate(), 0
 
     def start(tag: str, attributes: dict[str, str]) -> None:
         nonlocal count
@@ -126,27 +145,37 @@ def _xml(data: bytes, root: str) -> Element:
         if count > MOST_ELEMENTS:
             raise ValueError(f'has too many elements, allowed are {MOST_ELEMENTS:,}')
         line = str(parser.CurrentLineNumber)
-        builder.start(tag.rpartition(' ')[2], {**attributes, 'line': line})
+        builder.start(tag.rpartition(':')[2], {**attributes, 'line': line})
 
     def refuse(*_: Any) -> None:
         line = parser.CurrentLineNumber
         raise ValueError(f'line {line}: read DOCTYPE, allowed is XML without one')
 
     parser.StartElementHandler, parser.StartDoctypeDeclHandler = start, refuse
-    parser.EndElementHandler = lambda tag: builder.end(tag.rpartition(' ')[2])
+    parser.EndElementHandler = lambda tag: builder.end(tag.rpartition(':')[2])
     parser.CharacterDataHandler = builder.data
     try:
-        parser.Parse(data, True)
+        parser.Parse(_xml_text(data), True)
     except expat.ExpatError as error:
         reason = expat.ErrorString(error.code)
         raise ValueError(f'line {error.lineno}: is not XML: {reason}') from None
-    except LookupError:
-        raise ValueError('line 1: its encoding is unknown, allowed is UTF-8') from None
     found = builder.close()
     if found.tag != root:
         line = found.get('line')
         raise ValueError(f'line {line}: read <{short(found.tag)}>, allowed is <{root}>')
     return found
+
+
+def _xml_text(data: bytes) -> str:
+    """Return XML by its byte order mark, or in the encoding that it declares."""
+    declared = _DECLARED.match(data)
+    name = declared[1].decode().lower() if declared else 'utf-8'
+    # A declaration that is read byte by byte is not in UTF-16.
+    known = name if _ENCODINGS.match(name) and not name.startswith('utf') else 'utf-8'
+    try:
+        return text_of(data) if known == 'utf-8' else data.decode(known)
+    except (UnicodeError, LookupError):
+        raise ValueError(f'line 1: is not text in {short(name)}, allowed is UTF-8') from None
 
 
 def _text(element: Element, path: str) -> str:
@@ -210,7 +239,8 @@ def _kmz(data: bytes) -> Iterator[Row]:
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             for name in archive.namelist():
-                if name.lower().endswith('.kml'):
+                # macOS adds its own data by the name of each file.
+                if name.lower().endswith('.kml') and not name.startswith('__MACOSX/'):
                     with archive.open(name) as file:
                         files[name] = file.read(left + 1)
                     left -= len(files[name])
@@ -238,10 +268,18 @@ def _gpx(data: bytes) -> Iterator[Row]:
         for line in [item] if item.tag == 'rte' else item.findall('trkseg'):
             points = [*line.findall('rtept'), *line.findall('trkpt')]
             ring = [_gpx_position(point, label) for point in points]
+            if not ring:
+                continue
             gap, length = _gap(ring)
-            if gap <= _GAP * length:
+            if len({*map(tuple, ring)}) < 3:
+                few = f'{counted(len(ring), "point")}, allowed are 3 at different positions'
+                yield feature_row(label, few, name=name)
+            elif gap <= _GAP * length:
                 role = polygon_role([name])
+                ring, loops = _uncrossed(ring) if item.tag == 'trk' else (ring, '')
                 yield feature_row(label, 'Polygon', [ring], name=name, role=role)
+                if loops:
+                    yield feature_row(label, loops, name=name)
             else:
                 what = 'track' if item.tag == 'trk' else 'route'
                 yield feature_row(
@@ -257,11 +295,22 @@ def _gpx_position(point: Element, label: str) -> list[float]:
     return _flipped([point.get('lat'), point.get('lon')], where)
 
 
+def _uncrossed(ring: list[list[float]]) -> tuple[list[list[float]], str]:
+    """Return a recorded track without small loops where it crosses itself, and what is left out."""
+    whole = Polygon(ring)
+    if whole.is_valid:
+        return ring, ''
+    parts = sorted(shapely.get_parts(shapely.make_valid(whole)), key=lambda part: -part.area)
+    share = sum(part.area for part in parts[1:]) / max(parts[0].area, 1e-300)
+    if not isinstance(parts[0], Polygon) or share > _LOOPS:
+        return ring, ''
+    text = f'loops where it crosses itself, {share:.2%} of its area'
+    return [list(position) for position in parts[0].exterior.coords], text
+
+
 def _gap(ring: Sequence[Sequence[float]]) -> tuple[float, float]:
     """Return the distance between the ends of a track, and its length [m]."""
     degrees = np.array(ring).reshape(-1, 2)
-    if not len(degrees):
-        return math.inf, 0.0
     metres = _DEGREE * degrees * [math.cos(math.radians(degrees[0, 1])), 1.0]
     length = np.linalg.norm(np.diff(metres, axis=0), axis=1).sum()
     return float(np.linalg.norm(metres[-1] - metres[0])), float(length)
@@ -308,7 +357,9 @@ def _circle(label: str, centre: Any, radius: Any, inclusion: bool) -> Row:
 
 def _plan(data: bytes) -> Iterator[Row]:
     try:
-        plan = json.loads(data.decode('utf-8-sig'))
+        plan = json.loads(text_of(data))
+    except UnicodeError:
+        raise ValueError('is not UTF-8 text') from None
     except (ValueError, RecursionError) as error:
         line = f' in line {error.lineno}' if isinstance(error, json.JSONDecodeError) else ''
         raise ValueError(f'is not JSON{line}') from None
@@ -356,8 +407,8 @@ def _part(data: Mapping[str, Any], key: str, kind: type, where: str = '') -> Any
 def _lines(data: bytes) -> list[tuple[str, list[str]]]:
     """Return the name and the words of each line that is not empty or a comment."""
     try:
-        rows = data.decode('utf-8-sig').splitlines()
-    except UnicodeDecodeError:
+        rows = text_of(data).splitlines()
+    except UnicodeError:
         raise ValueError('is not UTF-8 text') from None
     lines = [(f'line {number}', row.split()) for number, row in enumerate(rows, 1)]
     return [(label, words) for label, words in lines if words and words[0][0] != '#']

@@ -11,6 +11,8 @@ import shapely
 from shapely.geometry import MultiPolygon, Polygon
 from shapely.geometry.base import BaseGeometry
 
+# Offsets of outlines that are jagged and have more corners take minutes and gigabytes.
+MOST_CORNERS, _FINEST, _COARSEST = 10_000, 0.01, 10.0  # and detail that may be removed [m]
 _WKT = re.compile(r'\s*(MULTI)?POLYGON\s*(Z|M|ZM)?\s*(\(|EMPTY)', re.IGNORECASE)
 
 
@@ -42,6 +44,21 @@ def sound(found: BaseGeometry, words: str, unit: str = 'm') -> BaseGeometry:
             named = (f'longitude {x:.6f}, latitude {y:.6f}', f'({x:.2f}, {y:.2f}) m')
             where = f' at {named[unit == "m"]}'
         raise ValueError(f'{words}: {what.lower()}{where}; allowed are polygons that are simple')
+    return found
+
+
+def with_few_corners(shape: BaseGeometry, where: str) -> BaseGeometry:
+    """Return polygons [m] without fine detail if they have very many corners; warn about that."""
+    corners, detail, found = int(shapely.get_num_coordinates(shape)), 0.5 * _FINEST, shape
+    while shapely.get_num_coordinates(found) > MOST_CORNERS and detail < _COARSEST:
+        detail = min(2.0 * detail, _COARSEST)
+        found = shapely.simplify(shape, detail)
+    if found is not shape:
+        left = int(shapely.get_num_coordinates(found))
+        warn(
+            f'{where}: has {corners:,} corners: read as {left:,}, at most {detail:g} m off; draw '
+            'fewer ones to choose them'
+        )
     return found
 
 

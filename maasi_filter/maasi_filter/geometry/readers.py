@@ -24,7 +24,7 @@ from maasi_filter.geometry.geojson import (
     with_role,
 )
 from maasi_filter.geometry.occupancy_map import read_map
-from maasi_filter.geometry.polygons import is_wkt, of_rings, of_text, warn
+from maasi_filter.geometry.polygons import is_wkt, of_rings, of_text, warn, with_few_corners
 from maasi_filter.settings import Settings
 
 _NUMBER = '-+.0123456789'  # first characters of numbers
@@ -110,6 +110,8 @@ def _read(origin: OriginSettings | None, value: Any, *key: str | int) -> BaseGeo
         if is_geojson(value) and key[0] in _ROLE_OF:
             value = with_role(features_of(value), _ROLE_OF[str(key[0])], f'environment.{key[0]}')
         found = read_shape(value, origin)
+        if not (isinstance(value, str) and Path(value).suffix.lower() in _MAPS):
+            found = with_few_corners(found, f'environment.{".".join(map(str, key))}')
     rounded = shapely.from_wkt(shapely.to_wkt(found, rounding_precision=4))
     return rounded if rounded.is_valid else shapely.from_wkt(str(found))
 

@@ -11,7 +11,7 @@ from pydantic import ValidationError
 
 from maasi_filter.geometry.area import Area, how_far
 from maasi_filter.geometry.environment import EnvironmentSettings
-from maasi_filter.geometry.geodesy import OriginSettings, geodetic, to_map
+from maasi_filter.geometry.geodesy import OriginSettings, on_ground, to_map
 from maasi_filter.geometry.geojson import is_geojson, points_of
 from maasi_filter.geometry.polygons import InputWarning
 from maasi_filter.wording import shown
@@ -25,7 +25,7 @@ def position_text(position: list[float], origin: OriginSettings | None) -> str:
     text = f'({", ".join(f"{value + 0.0:.4g}" for value in position)}) m'
     if origin is None:
         return text
-    latitude, longitude = geodetic(np.array([position]), origin)[0, :2].tolist()
+    latitude, longitude = on_ground(np.array([position[:2]]), origin)[0].tolist()
     return f'{text}, latitude {latitude:.6f}, longitude {longitude:.6f}'
 
 
@@ -54,7 +54,8 @@ def put_on_map(layer: Layer, robots: Mapping[str, dict[str, Any]]) -> None:
             warnings.simplefilter('ignore', InputWarning)
             origin = EnvironmentSettings.model_validate(given).origin
     except ValidationError:
-        return  # validation reports its errors later
+        # Validation reports its errors later, and not those of positions.
+        origin, points = OriginSettings(latitude=0.0, longitude=0.0), []
     for name, values in robots.items():
         for key, value, put in _positions(name, values):
             put(_on_map(layer, key, value, origin))
