@@ -10,6 +10,7 @@ from rasterio.warp import transform
 from maasi_filter.geometry.area import Area
 from maasi_filter.geometry.environment import EnvironmentSettings
 from maasi_filter.geometry.geodesy import OriginSettings, to_map
+from maasi_filter.geometry.raster import read_raster
 
 ORIGIN = {'latitude': 46.6, 'longitude': 9.9, 'altitude': 1800.0}
 
@@ -138,6 +139,60 @@ def test_a_geotiff_is_at_its_coordinates(tmp_path):
     fixed = area({'file': path, 'unit': 'm', 'zero': 1800.0}, origin=ORIGIN)
     assert fixed.warnings == []
     assert fixed.terrain.height([0.0, 0.0]) == pytest.approx(30.0, abs=1e-3)
+
+
+@pytest.mark.parametrize('scale, offset', [(0.1, 0.0), (1.0, 1000.0), (0.25, -50.0)])
+def test_scaled_numbers_of_a_geotiff_are_heights_in_metres(tmp_path, scale, offset):
+    """Many programs store heights as whole numbers."""
+
+    def stored(x, y):
+        return np.round((100.0 + 0.2 * x - offset) / scale)
+
+    path, _ = geotiff(tmp_path / 'hill.tif', function=stored)
+    with rasterio.open(path, 'r+') as file:
+        file.scales, file.offsets = (scale,), (offset,)
+    found = area({'file': path, 'unit': 'm', 'zero': 0.0}, origin=ORIGIN).terrain
+    assert found.height([0.0, 0.0]) == pytest.approx(100.0, abs=0.5)
+    assert found.height([40.0, 0.0]) == pytest.approx(108.0, abs=0.5 + 0.5 * scale)
+    ground = {'bounds': [[0.0, 40.0], [0.0, 30.0]], 'origin': ORIGIN, 'prior': path}
+    raster = read_raster(EnvironmentSettings.model_validate(ground))
+    assert raster.values.max() / raster.values.min() == pytest.approx(139.5 / 80.5, rel=0.01)
+
+
+def test_a_band_of_transparency_is_no_second_band(tmp_path):
+    path, _ = geotiff(tmp_path / 'one.tif', function=lambda x, y: 100.0 + 0.0 * x)
+    with rasterio.open(path) as file:
+        facts, heights = file.profile | {'count': 2}, file.read(1)
+    for name, alpha in (('two.tif', 'NO'), ('alpha.tif', 'YES')):
+        with rasterio.open(tmp_path / name, 'w', alpha=alpha, **facts) as file:
+            file.write(heights, 1)
+            file.write(np.full_like(heights, 255), 2)
+    fixed = {'file': str(tmp_path / 'alpha.tif'), 'unit': 'm', 'zero': 0.0}
+    assert area(fixed, origin=ORIGIN).terrain.height([1.0, 1.0]) == pytest.approx(100.0)
+    with pytest.raises(ValueError, match=r'two\.tif: has 2 bands, allowed is one'):
+        area(str(tmp_path / 'two.tif'), origin=ORIGIN)
+
+
+@pytest.mark.parametrize('declared', [None, -1.0, 'nan'])
+def test_the_usual_number_without_data_is_no_height(tmp_path, declared):
+    """Whatever a file declares, -9999 m is nowhere on the earth."""
+    line = '' if declared is None else f'NODATA_value {declared}\n'
+    heights = ['7 ' * 20] * 10 + ['7 ' * 5 + '-9999 ' + '7 ' * 14] + ['7 ' * 20] * 9
+    text = f'ncols 20\nnrows 20\nxllcorner 0\nyllcorner 0\ncellsize 2\n{line}'
+    path = tmp_path / 'a.asc'
+    path.write_text(text + '\n'.join(heights))
+    with pytest.raises(ValueError, match=r'a\.asc: has no height at 1 of \d+ cells'):
+        area(str(path))
+    path, _ = geotiff(tmp_path / 'a.tif', function=lambda x, y: -9999.0 + 0.0 * x)
+    with pytest.raises(ValueError, match=r'a\.tif: has no height at'):
+        area(str(path), origin=ORIGIN)
+
+
+@pytest.mark.parametrize('encoding', ['utf-8', 'utf-8-sig', 'utf-16'])
+def test_a_grid_is_read_as_its_byte_order_mark_says(tmp_path, encoding):
+    text = 'ncols 20\r\nnrows 20\r\nxllcorner 0\r\nyllcorner 0\r\ncellsize 2\r\n'
+    (tmp_path / 'a.asc').write_bytes((text + '7 ' * 400).encode(encoding))
+    assert area(str(tmp_path / 'a.asc')).terrain.height([3.0, 3.0]) == 7.0
 
 
 def test_units_and_gaps_of_a_geotiff(tmp_path, monkeypatch):

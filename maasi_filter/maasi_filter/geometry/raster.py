@@ -6,6 +6,7 @@ import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -85,6 +86,13 @@ def _over(values: FloatArray, extent: list[list[float]]) -> Raster:
     return Raster(values, cells)
 
 
+def scaled_band(file: Any, band: int, unknown: float) -> FloatArray:
+    """Return a band of a file of rasterio in its unit, which may be stored as other numbers."""
+    values = file.read(band, masked=True).astype(float)
+    found = values * file.scales[band - 1] + file.offsets[band - 1]
+    return np.asarray(found.filled(unknown))
+
+
 def _of_geotiff(path: str, origin: OriginSettings | None, band: str | None) -> Raster:
     """Return a band of a GeoTIFF in its own coordinates; cells without data are 0."""
     try:
@@ -107,7 +115,7 @@ def _of_geotiff(path: str, origin: OriginSettings | None, band: str | None) -> R
         u, v = np.transpose(_CORNERS) * [[file.width], [file.height]]
         ends = a * u + b * v + c, d * u + e * v + f
         corners = to_map(np.array(transform(crs, 'EPSG:4326', *ends)).T, origin)
-        values = file.read(int(band or 1), masked=True).astype(float).filled(0.0)
+        values = scaled_band(file, int(band or 1), 0.0)
 
     def cells(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
         degrees = geodetic(np.stack([x.ravel(), y.ravel()], axis=1), origin)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import warnings
 from collections.abc import Sequence
@@ -14,8 +15,10 @@ import numpy as np
 from maasi_filter.arrays import FloatArray
 from maasi_filter.geometry.environment import EnvironmentSettings
 from maasi_filter.geometry.geodesy import OriginSettings, geodetic
+from maasi_filter.geometry.map_files import encoding_of
 from maasi_filter.geometry.occupancy_map import check_pixels
 from maasi_filter.geometry.polygons import short
+from maasi_filter.geometry.raster import scaled_band
 from maasi_filter.geometry.terrain import Terrain
 
 _GEOTIFF = '.tif', '.tiff'
@@ -26,7 +29,8 @@ _UNITS = {
     **dict.fromkeys(('us-ft', 'us survey foot', 'ftus'), 'us-ft'),
 }
 _HEADER = 'ncols', 'nrows', 'xllcorner', 'xllcenter', 'yllcorner', 'yllcenter', 'cellsize'
-_NO_DATA = 'nodata_value'
+# By default; programs also use it where another value is declared, or none.
+_NO_DATA, _NO_HEIGHT = 'nodata_value', -9999.0
 _SPARE = 1e-6  # by which an area may exceed its file [cells]
 # Heights beyond these are of another unit, or no heights at all [m].
 _DEEPEST, _HIGHEST = -12_000.0, 9_000.0
@@ -155,14 +159,17 @@ def _projection(path: str) -> Path | None:
 def _of_ascii(path: str) -> _Grid:
     """Read an Esri ASCII grid in metres of the map."""
     header: dict[str, float] = {}
-    with open(path, encoding='utf-8', errors='replace') as file:
+    with open(path, 'rb') as start:
+        encoding = encoding_of(start.read(2))
+    with open(path, encoding=encoding, errors='replace') as file:
         line, number = file.readline(), 1
         while (words := line.split()) and words[0][0].isalpha():
             name = words[0].lower()
             if name not in (*_HEADER, _NO_DATA) or len(words) != 2:
                 allowed = f'allowed are {", ".join((*_HEADER, _NO_DATA))}, each with a number'
                 raise ValueError(f'line {number}: read {short(line.strip())}, {allowed}')
-            header[name] = _number(words[1], number)
+            unknown = name == _NO_DATA and words[1].lower() == 'nan'
+            header[name] = math.nan if unknown else _number(words[1], number)
             line, number = file.readline(), number + 1
         shape, corner, step = _layout(header)
         values = np.array(f'{line} {file.read()}'.split())
@@ -175,8 +182,8 @@ def _of_ascii(path: str) -> _Grid:
     except ValueError:
         wrong = next(item for item in values.tolist() if not _is_number(item))
         raise ValueError(f'read {short(wrong)} as a height, allowed are numbers') from None
-    rows[rows == header.get(_NO_DATA, -9999.0)] = np.nan
-    rows[~np.isfinite(rows)] = np.nan
+    rows[rows == header.get(_NO_DATA, _NO_HEIGHT)] = np.nan
+    rows[~np.isfinite(rows) | (rows == _NO_HEIGHT)] = np.nan
     # The first row is that in the north.
     return _Grid(np.ascontiguousarray(rows[::-1].T), corner, np.array([step, step]))
 
@@ -235,14 +242,17 @@ def _of_rasterio(path: str, origin: OriginSettings, bounds: FloatArray) -> _Grid
         with file:
             if file.crs is None:
                 raise ValueError('has no coordinate system: add it with gdal_translate -a_srs')
-            if file.count != 1:
-                raise ValueError(f'has {file.count} bands, allowed is one with heights')
+            # Where an alpha band is 0, there is no data.
+            alpha = rasterio.enums.ColorInterp.alpha
+            bands = [band for band in file.indexes if file.colorinterp[band - 1] != alpha]
+            if len(bands) != 1:
+                raise ValueError(f'has {len(bands)} bands, allowed is one with heights')
             check_pixels(file.shape)
-            crs, grid, unit = file.crs, ~file.transform, file.units[0] or None
-            values = file.read(1, masked=True).astype(float).filled(np.nan)
+            crs, grid, unit = file.crs, ~file.transform, file.units[bands[0] - 1] or None
+            values = scaled_band(file, bands[0], math.nan)
     except rasterio.errors.RasterioError:
         raise ValueError('is not a complete GeoTIFF') from None
-    values[~np.isfinite(values)] = np.nan
+    values[~np.isfinite(values) | (values == _NO_HEIGHT)] = np.nan
 
     def cells(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return columns and rows of positions [m, map], from the centre of the first cell."""

@@ -182,7 +182,8 @@ def checked(
             layer = merge(layer, under(key, value, {key: origin}, layer.folder))
         layer = _with_folders(layer)
     scenario = validate(model, layer)
-    lines = [layer.located(problem) for problem in problems(scenario)]
+    # Some are found for filter and planner, or for several robots.
+    lines = dict.fromkeys(layer.located(problem) for problem in problems(scenario))
     if lines:
         raise ScenarioError('\n'.join(lines))
     for warning in warnings_about(scenario) if layer.folder else ():
