@@ -97,7 +97,7 @@ def test_a_walked_border_may_cross_itself_a_little(tmp_path, seed):
     ]
     walked = np.array(sides) + 2e-5 * generator.standard_normal((len(sides), 2))
     text = gpx(track(closed(walked.tolist()), 'border'))
-    with pytest.warns(InputWarning, match=r'\(border\): loops where it crosses itself, 0\.\d+%'):
+    with pytest.warns(InputWarning, match=r'\(border\): loops where it crosses itself, 0\.\d+ %'):
         made = environment(written(tmp_path, 'a.gpx', text.encode()))
     assert made.area.area == pytest.approx(SIZES['area'], rel=0.05)
     eight = [FIELD[0], FIELD[2], FIELD[1], FIELD[3]]

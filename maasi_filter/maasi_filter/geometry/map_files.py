@@ -304,7 +304,7 @@ def _uncrossed(ring: list[list[float]]) -> tuple[list[list[float]], str]:
     share = sum(part.area for part in parts[1:]) / max(parts[0].area, 1e-300)
     if not isinstance(parts[0], Polygon) or share > _LOOPS:
         return ring, ''
-    text = f'loops where it crosses itself, {share:.2%} of its area'
+    text = f'loops where it crosses itself, {100.0 * share:.2f} % of its area'
     return [list(position) for position in parts[0].exterior.coords], text
 
 
