@@ -1,13 +1,17 @@
 """Headless Chromium for tests of pages, which are skipped without one."""
 
+import base64
 import contextlib
 import os
 import shutil
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 from urllib.parse import urlsplit
 
+import cv2
+import numpy as np
 import pytest
 from playwright.sync_api import sync_playwright
 from waiting import PATIENCE, wait_until
@@ -54,6 +58,41 @@ class Page:
     def open(self, address):
         self.page.goto(address)
         self.page.wait_for_selector('body[data-ready]')
+
+    def show(self, scene, *events):
+        """Open the replay of a scene and its events."""
+        # Needs the built workspace, which scripts/test may not have yet.
+        from maasi_sim.run.view.event_log import EventLog
+        from maasi_sim.run.view.page_file import write_replay
+
+        with tempfile.TemporaryDirectory() as folder:
+            file = Path(folder) / 'page.html'
+            write_replay(EventLog(scene, list(events)), file)
+            self.open(file.as_uri())
+
+    def place(self, *position):
+        """Return where a position [m] is on the map [px]."""
+        return self.page.evaluate(f'maasi.camera.project({list(map(float, position))})')[:2]
+
+    def pixels(self, canvas='#map'):
+        """Return the pixels of a canvas: red, green, blue and opacity."""
+        address = self.page.evaluate(f'document.querySelector("{canvas}").toDataURL()')
+        data = np.frombuffer(base64.b64decode(address.partition(',')[2]), np.uint8)
+        return cv2.imdecode(data, cv2.IMREAD_UNCHANGED)[:, :, [2, 1, 0, 3]].astype(int)
+
+    def colour(self, x, y, canvas='#map'):
+        return self.pixels(canvas)[round(y), round(x)][:3].tolist()
+
+    def near(self, colour, tolerance=40):
+        """Return which pixels of the map nearly have a colour."""
+        return np.abs(self.pixels()[:, :, :3] - colour).max(axis=2) < tolerance
+
+    def tip(self, *position):
+        """Return what is written at a position [m] of the map."""
+        self.settle()
+        (x, y), box = self.place(*position), self.page.locator('#map').bounding_box()
+        self.page.mouse.move(box['x'] + x, box['y'] + y)
+        return self.page.inner_text('#tip') if self.page.is_visible('#tip') else ''
 
     def number(self):
         return int(self.page.inner_text('#found_count').split()[0])

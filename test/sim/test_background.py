@@ -11,8 +11,6 @@ from pydantic import ValidationError
 from maasi_filter.geometry.environment import EnvironmentSettings
 from maasi_filter.geometry.geodesy import OriginSettings, geodetic
 from maasi_sim.run.missions import load_mission
-from maasi_sim.run.view.event_log import EventLog
-from maasi_sim.run.view.page_file import write_replay
 from maasi_sim.run.view.scene import scene_of
 from maasi_sim.scenario.background import background_of, background_problems
 from maasi_sim.scenario.loading import config_folder, load_scenario
@@ -120,14 +118,6 @@ def test_what_cannot_be_placed_is_refused_by_name_with_what_to_do(tmp_path):
     assert not list(background_problems(environment({})))
 
 
-def colour_at(shown, place):
-    """Return the colour of a place of the map: red, green, blue."""
-    x, y = shown.page.evaluate(f'maasi.camera.project({place})')[:2]
-    address = shown.page.evaluate("document.getElementById('map').toDataURL()")
-    data = np.frombuffer(base64.b64decode(address.partition(',')[2]), np.uint8)
-    return cv2.imdecode(data, cv2.IMREAD_COLOR)[round(y), round(x), ::-1].tolist()
-
-
 def test_the_page_has_it_under_the_map_and_asks_nobody(chromium, tmp_path):
     field = load_mission('field').scenario
     content = field.content()
@@ -136,23 +126,18 @@ def test_the_page_has_it_under_the_map_and_asks_nobody(chromium, tmp_path):
     extent = [[-300, 300], [-250, 250]]
     content['environment']['background'] = {'file': str(tmp_path / 'map.png'), 'extent': extent}
     scene = scene_of('field', Scenario.model_validate(content))
-    write_replay(EventLog(scene, []), tmp_path / 'page.html')
     with chromium() as shown:
-        shown.open((tmp_path / 'page.html').as_uri())
+        shown.show(scene)
         shown.until('maasi.map.background.image?.complete')
         shown.settle()
-        assert colour_at(shown, [-60, 33, 0]) == pytest.approx([200, 60, 30], abs=6)
+        assert shown.colour(*shown.place(-60, 33)) == pytest.approx([200, 60, 30], abs=6)
         shown.page.click('button[data-layer=background]')
         shown.settle()
-        assert colour_at(shown, [-60, 33, 0]) != pytest.approx([200, 60, 30], abs=40)
-        box = shown.page.locator('#map').bounding_box()
+        assert shown.colour(*shown.place(-60, 33)) != pytest.approx([200, 60, 30], abs=40)
         # Latitude and longitude under the pointer need a cell of the map.
         grid = [0.0, 'map', '', [-200, -150, 0], [10, 10, 0], [41, 31, 1], 'z' * 41 * 31, 0.0]
-        write_replay(EventLog(scene, [grid]), tmp_path / 'page.html')
-        shown.open((tmp_path / 'page.html').as_uri())
-        x, y = shown.page.evaluate('maasi.camera.project([-100, 50, 0])')[:2]
-        shown.page.mouse.move(box['x'] + x, box['y'] + y)
-        words = shown.page.inner_text('#tip')
+        shown.show(scene, grid)
+        words = shown.tip(-100, 50)
         expected = geodetic(np.array([[-100.0, 50.0]]), field.environment.origin)[0, :2]
         read = re.search(r'latitude ([\d.]+), longitude ([\d.]+)$', words).groups()
         assert list(map(float, read)) == pytest.approx(expected.tolist(), abs=1e-5)

@@ -9,8 +9,6 @@ import shapely
 from maasi_filter.geometry.area import Area
 from maasi_filter.geometry.environment import EnvironmentSettings
 from maasi_filter.geometry.geodesy import OriginSettings
-from maasi_sim.run.view.event_log import EventLog
-from maasi_sim.run.view.page_file import write_replay
 from maasi_sim.run.view.scene import zones_of
 from maasi_sim.run.view.server import Hub, ViewServer
 
@@ -30,7 +28,7 @@ def scene(bounds, **more):
 
 def click(shown, corner, twice=False):
     """Click at a place, and return the place of the pixel, which is what is drawn."""
-    x, y = map(round, shown.page.evaluate(f'maasi.camera.project({[*corner, 0]})')[:2])
+    x, y = map(round, shown.place(*corner))
     place = shown.page.evaluate(f'maasi.camera.place({x}, {y})')
     box = shown.page.locator('#map').bounding_box()
     (shown.page.mouse.dblclick if twice else shown.page.mouse.click)(box['x'] + x, box['y'] + y)
@@ -66,9 +64,8 @@ def same(shape, ring):
 def test_what_is_drawn_and_saved_is_what_the_next_run_reads(chromium, tmp_path, origin):
     given = EnvironmentSettings.model_validate(OLD)
     facts = {'zones': zones_of(Area(given)), 'origin': origin and origin.model_dump()}
-    write_replay(EventLog(scene(given.bounds, **facts), []), tmp_path / 'page.html')
     with chromium(accept_downloads=True) as shown:
-        shown.open((tmp_path / 'page.html').as_uri())
+        shown.show(scene(given.bounds, **facts))
         # Nothing is drawn: the run's own.
         own = Area(EnvironmentSettings(area=str(saved(shown, tmp_path))))
         assert origin or same(own.shapes['area'][0], OLD['area'])

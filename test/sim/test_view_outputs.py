@@ -1,6 +1,5 @@
 """Outputs of a run other than the page: videos, and a layout for Foxglove."""
 
-import base64
 import json
 import re
 from unittest.mock import patch
@@ -17,7 +16,7 @@ from maasi_sim.run.rviz_view import shown_topics
 from maasi_sim.run.view import video, view_run
 from maasi_sim.run.view.event_log import EventLog
 from maasi_sim.run.view.event_maker import EventMaker
-from maasi_sim.run.view.page_file import FOLDER, write_replay
+from maasi_sim.run.view.page_file import write_replay
 from maasi_sim.run.view.recording import event_log
 from maasi_sim.run.view.scene import scene_of
 from maasi_sim.scenario.loading import config_folder
@@ -36,8 +35,11 @@ def frames(log, path, speed=1e3):
         pictures.append(picture.astype(int))
 
 
+BLUE = 0, 114, 178
+
+
 def bluish(picture):
-    return np.abs(picture.astype(int) - (178, 114, 0)).max(axis=2) < 40
+    return np.abs(picture.astype(int) - BLUE[::-1]).max(axis=2) < 40
 
 
 def test_a_video_shows_the_run_move(tmp_path):
@@ -144,18 +146,15 @@ def test_a_robot_that_left_goes_nowhere_in_a_video(departing, tmp_path):
     assert bluish(pictures[5]).sum() - legend < 0.1 * (bluish(pictures[3]).sum() - legend)
 
 
-def test_a_robot_that_left_goes_nowhere_on_the_page(chromium, departing, tmp_path):
-    write_replay(departing, tmp_path / 'page.html')
+def test_a_robot_that_left_goes_nowhere_on_the_page(chromium, departing):
     with chromium() as shown:
-        shown.open((tmp_path / 'page.html').as_uri())
+        shown.show(departing.scene, *departing.events)
         pixels = []
         for seconds, text in ((1.5, 'moving'), (2.5, 'left')):
             shown.seek(seconds)
             assert shown.page.is_hidden('#card')
             assert shown.page.inner_text('#robots tr[data-robot=mambo] td.text') == text
-            address = shown.page.evaluate("document.getElementById('map').toDataURL()")
-            data = np.frombuffer(base64.b64decode(address.partition(',')[2]), np.uint8)
-            pixels.append(bluish(cv2.imdecode(data, cv2.IMREAD_COLOR)).sum())
+            pixels.append(shown.near(BLUE).sum())
         assert pixels[1] < 0.1 * pixels[0]
         shown.page.click('#robots tr[data-robot=mambo]')
         shown.settle()
@@ -219,25 +218,17 @@ def test_the_page_says_why_in_a_sentence_and_what_is_at_a_point_of_the_map(chrom
         heads, cells = (page.evaluate(sides.format(part)) for part in ('th', 'tr.chosen td'))
         assert heads == cells
 
-        def tip(place):
-            shown.settle()  # the map may just take another size
-            x, y = page.evaluate(f'maasi.camera.project({list(place)})')[:2]
-            box = page.locator('#map').bounding_box()
-            page.mouse.move(box['x'] + x, box['y'] + y)
-            return page.inner_text('#tip')
-
-        assert tip(waypoint).startswith(f'candidate {chosen} at (')
-        assert tip(page.evaluate('maasi.log.at("robot", "mambo", 0)[3]')).startswith(
-            'mambo: moving'
-        )
+        assert shown.tip(*waypoint).startswith(f'candidate {chosen} at (')
+        robot = page.evaluate('maasi.log.at("robot", "mambo", 0)[3]')
+        assert shown.tip(*robot).startswith('mambo: moving')
         page.keyboard.press('Escape')
-        assert tip((-0.25, 2.35)) == (
+        assert shown.tip(-0.25, 2.35) == (
             'explored 0 %, 1.65 expected targets per m² left, at (-0.25, 2.35) m'
         )
         found = next(event for event in log.events if event[1] == 'found' and event[3])
         shown.seek(found[0])
         number, x, y, *_ = found[3][0]
-        assert tip((x, y)).startswith(f'target {number}: found by ')
+        assert shown.tip(x, y).startswith(f'target {number}: found by ')
 
 
 def test_on_a_phone_in_the_dark_the_legend_is_whole_and_it_plays_by_the_space_bar(
@@ -309,17 +300,6 @@ def test_texts_and_robots_stand_out(chromium, searched, theme):
         assert len(tints) == 2
         for tint in tints:
             assert contrast([int(value) for value in re.findall(r'\d+', tint)], grey) >= 3.0
-
-
-def test_robots_have_the_colours_of_the_page():
-    text = (FOLDER / 'colours.js').read_text()
-    robots = re.search(r'const ROBOTS = (\[.*\]);', text).group(1)
-    assert tuple(re.findall(r'#\w+', robots.upper())) == colours.ROBOTS
-    named = re.search(r'const NAMED = (\{.*\});', text).group(1)
-    pairs = re.findall(r"(\w+): '(#\w+)'", named)
-    assert {name: colour.upper() for name, colour in pairs} == colours.NAMED
-    for name in ('FOUND', 'POTENTIAL', 'SEEN'):
-        assert f"{name} = '{getattr(colours, name).lower()}'" in text
 
 
 def test_a_video_of_another_kind_is_refused(tmp_path, capsys):

@@ -13,9 +13,7 @@ from maasi_filter.models.pose import Pose
 from maasi_filter.records import FoundTarget
 from maasi_sim.run import facts
 from maasi_sim.run.missions import load_mission
-from maasi_sim.run.view.event_log import EventLog
 from maasi_sim.run.view.event_maker import EventMaker
-from maasi_sim.run.view.page_file import write_replay
 from maasi_sim.run.view.pictures import cut_out, picture
 from maasi_sim.run.view.scene import scene_of
 
@@ -84,16 +82,14 @@ def test_a_sensor_without_a_box_or_a_robot_without_a_camera_has_the_whole_image(
         assert size == whole and outline == [] and (marks is None) == (not robot)
 
 
-def test_the_page_dims_what_is_not_counted(chromium, tmp_path):
+def test_the_page_dims_what_is_not_counted(chromium):
     pose = Pose.from_yaw([1.0, 1.0, 1.0], 0.3)
     message = image_of(ROBOTS['mambo']['camera'], np.array([[1.2, 1.0, 0.0]]), pose)
     content = picture(message, ROBOTS['mambo'], pose, np.zeros((0, 3)))
     state = [0.0, 'robot', 'mambo', [1.0, 1.0, 1.0, 0.3], 1.0, 1, '']
     scene = {'name': 'demo', 'robots': ROBOTS, 'bounds': [[0, 3], [0, 3]]}
-    log = EventLog(scene, [state, [0.0, 'picture', 'mambo', *content]])
-    write_replay(log, tmp_path / 'page.html')
     with chromium() as shown:
-        shown.open((tmp_path / 'page.html').as_uri())
+        shown.show(scene, state, [0.0, 'picture', 'mambo', *content])
         figure = shown.page.locator('#cameras figure[data-robot=mambo]')
         assert figure.locator('svg path').count() == 2
         assert 'Dimmed' in shown.page.inner_text('#cameras')

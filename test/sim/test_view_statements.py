@@ -19,8 +19,6 @@ from waiting import wait_until
 from maasi_filter.geometry.geodesy import OriginSettings, geodetic
 from maasi_msgs.srv import AddSighting, MarkSearched, ReviewTarget
 from maasi_sim.run.view.control_node import Control
-from maasi_sim.run.view.event_log import EventLog
-from maasi_sim.run.view.page_file import write_replay
 from maasi_sim.run.view.report_request import ReportRequest, read_report
 from maasi_sim.run.view.server import Hub, ViewServer
 
@@ -176,11 +174,10 @@ def test_positions_can_be_typed(chromium, origin):
     assert zone.hausdorff_distance(shapely.Polygon([*ring[:2], last[:2]])) < 5e-3
 
 
-def test_a_replay_shows_statements_without_buttons(chromium, tmp_path):
+def test_a_replay_shows_statements_without_buttons(chromium):
     crop = [3.0, 'crop', '', 2, PIXEL]
-    write_replay(EventLog(SCENE, [*EVENTS, crop, *REPORTS]), tmp_path / 'page.html')
     with chromium() as shown:
-        shown.open((tmp_path / 'page.html').as_uri())
+        shown.show(SCENE, *EVENTS, crop, *REPORTS)
         assert not shown.page.is_visible('button[data-report=sighting]')
         shown.seek(3.5)
         legend = shown.page.inner_text('#legend')
@@ -201,11 +198,7 @@ def test_a_replay_shows_statements_without_buttons(chromium, tmp_path):
         assert images.count() == 1
         assert images.get_attribute('alt') == 'Target 2 in the image of a camera'
         assert images.evaluate('(image) => image.decode().then(() => image.naturalWidth)') == 3
-        tips = []
-        for corner in ([70, 20], [30, 20]):
-            x, y = shown.page.evaluate(f'maasi.camera.project({[*corner, 0]})')[:2]
-            shown.page.evaluate(f'maasi.point({x}, {y})')
-            tips.append(shown.page.inner_text('#tip'))
+        tips = [shown.tip(70, 20), shown.tip(30, 20)]
         assert tips[0].startswith('sighting: 0.5 expected within 8 m, since 4 s, at (70, 20) m')
         assert tips[1].startswith('searched by others, probability of detection 0.7, since 5 s')
 

@@ -1,17 +1,15 @@
 """What keeps still on the page, and what is the same on page and report: counts, sizes, icons."""
 
-import base64
 from contextlib import closing
 
-import cv2
 import numpy as np
 import pytest
 
+from maasi_filter.records import FoundTarget
 from maasi_sim.run.facts import Ended, Found, RobotAt, Truth
 from maasi_sim.run.missions import load_mission
-from maasi_sim.run.view.event_log import EventLog
 from maasi_sim.run.view.event_maker import EventMaker
-from maasi_sim.run.view.page_file import FOLDER, write_replay
+from maasi_sim.run.view.page_file import FOLDER
 from maasi_sim.run.view.scene import scene_of
 from maasi_sim.run.view.server import Hub, ViewServer
 
@@ -22,7 +20,7 @@ CAMERA = (
 
 
 def ended(scene, found, truth):
-    """Return the events of a run that finds something at 1 s and ends at 4 s."""
+    """Return scene and events of a run that finds something at 1 s and ends at 4 s."""
     events = []
     maker = EventMaker(scene, events.append)
     for fact in (
@@ -34,13 +32,11 @@ def ended(scene, found, truth):
         Ended(4.0, 'time_limit', 'the limit of 4 s'),
     ):
         maker.add(fact)
-    return EventLog(maker.scene, events)
+    return maker.scene, *events
 
 
 @pytest.fixture
-def run(tmp_path):
-    from maasi_filter.records import FoundTarget
-
+def run():
     scenario = load_mission('mambo_turtlebot').scenario
     truth = np.array([[1.0, 1.0], [2.0, 2.0]])
     found = [
@@ -48,14 +44,12 @@ def run(tmp_path):
         for number, place in enumerate(([1.0, 1.0], [0.3, 1.7]))
     ]
     scene = scene_of('demo', scenario) | {'targets': 2, 'scoring_radius': 0.2}
-    path = tmp_path / 'page.html'
-    write_replay(ended(scene, found, truth), path)
-    return path
+    return ended(scene, found, truth)
 
 
 def test_the_end_card_and_the_legend_do_not_move_the_map(chromium, run):
     with chromium() as shown:
-        shown.open(run.as_uri())
+        shown.show(*run)
         seen = []
         for time in (0.5, 2.0, 4.0):
             shown.seek(time)
@@ -90,7 +84,7 @@ def test_a_stop_and_its_answer_do_not_move_the_map(chromium):
 
 def test_true_targets_count_and_missed_is_said_of_an_ended_search_only(chromium, run):
     with chromium() as shown:
-        shown.open(run.as_uri())
+        shown.show(*run)
         shown.seek(2.0)
         assert shown.page.inner_text('#found_count') == '1 of 2 (1 false)'
         counts = shown.page.text_content('#counts')
@@ -113,18 +107,14 @@ def test_icons_are_drawn():
         assert '&#x2' not in text, path.name
 
 
-def test_robots_have_one_size_whatever_their_radius(chromium, tmp_path):
+def test_robots_have_one_size_whatever_their_radius(chromium):
     sizes = {}
     for radius in (0.05, 0.4):
         robots = {'rover': {'radius': radius, 'flies': False}}
         scene = {'name': 'plane', 'robots': robots, 'bounds': [[0, 4], [0, 4]]}
         state = [0.0, 'robot', 'rover', [2.2, 2.3, 0.0, 0.0], 1.0, 0, '']
-        write_replay(EventLog(scene, [state]), tmp_path / 'page.html')
         with chromium() as shown:
-            shown.open((tmp_path / 'page.html').as_uri())
+            shown.show(scene, state)
             shown.seek(0.0)
-            address = shown.page.evaluate("document.getElementById('map').toDataURL()")
-            data = np.frombuffer(base64.b64decode(address.partition(',')[2]), np.uint8)
-            pixels = cv2.imdecode(data, cv2.IMREAD_COLOR)[:, :, ::-1].astype(int)
-            sizes[radius] = int((np.abs(pixels - (0, 114, 178)).max(axis=2) < 60).sum())
+            sizes[radius] = int(shown.near((0, 114, 178), 60).sum())
     assert sizes[0.05] == sizes[0.4] > 60

@@ -17,7 +17,6 @@ from maasi_sim.run.bag import Bag, BagWriter, load_types
 from maasi_sim.run.message_facts import is_read
 from maasi_sim.run.run_options import ViewOptions
 from maasi_sim.run.topics import message_class
-from maasi_sim.run.view.event_log import EventLog
 from maasi_sim.run.view.live_view import RunPage
 from maasi_sim.run.view.page_file import REPLAY, empty_page, write_replay
 from maasi_sim.run.view.recording import read_events
@@ -130,7 +129,7 @@ def test_the_page_shows_the_bag_and_why_a_robot_goes_there(run):
         assert replay.number() == sum(item['time'] <= 10.0 for item in run.report['found'])
         left = page.text_content('#counts dt:text-is("expected left") + dd')
         assert float(left) == pytest.approx(expected, rel=0.01)
-        x, y = page.evaluate('maasi.camera.project(maasi.log.at("robot", "mambo", 10.0)[3])')[:2]
+        x, y = replay.place(*page.evaluate('maasi.log.at("robot", "mambo", 10.0)[3]')[:3])
         box = page.locator('#map').bounding_box()
         page.mouse.click(box['x'] + x, box['y'] + y)
         replay.settle()
@@ -206,13 +205,12 @@ def test_pictures_of_the_cameras_have_circles_around_the_markers(run, tmp_path):
 
 
 @needs_chromium
-def test_a_search_in_space_from_above_is_shaded_by_its_columns(tmp_path):
+def test_a_search_in_space_from_above_is_shaded_by_its_columns():
     scene = {'name': 'space', 'robots': {}, 'bounds': [[0, 1], [0, 1], [0, 2]]}
     # Explored at the ground, and above it of one column only.
     grid = [0.0, 'map', '', [0, 0, 0], [1, 1, 1], [2, 2, 3], '0zz0zz0zz000', 0.5]
-    write_replay(EventLog(scene, [grid]), tmp_path / 'page.html')
     with chromium() as shown:
-        shown.open((tmp_path / 'page.html').as_uri())
+        shown.show(scene, grid)
         shown.page.click('#space')
         shown.settle()
         shades = shown.page.evaluate(

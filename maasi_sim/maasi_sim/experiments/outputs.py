@@ -9,7 +9,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
-import numpy as np
 import yaml
 
 from maasi_sim.experiments.brief import brief_tables
@@ -99,7 +98,6 @@ class Section:
     """What the page shows of an experiment, in words and cells, stored with its figure."""
 
     rests: str
-    duration: str
     cases: dict[str, dict[str, str]]
     pairs: list[list[str]]
     claims: list[Finding] = field(default_factory=list)
@@ -134,10 +132,7 @@ def section_of(results: Results, every: bool = True) -> Section:
     rests = f'{maps} run{"" if maps == "1" else "s"} of each case'
     if any(number < least for number, least in zip(made, wanted)):
         rests = f'**not in full: {rests}, the paper has {max(wanted)}**'
-    times = np.concatenate([results.values(name, 'processor_time') for name in results.names()])
-    times = times[~np.isnan(times)]
-    duration = f' A run takes about {np.median(times):.1f} s on one core.' if len(times) else ''
-    return Section(rests, duration, case_cells(results), pair_cells(results), findings(results))
+    return Section(rests, case_cells(results), pair_cells(results), findings(results))
 
 
 def stored_section(store: Path) -> Section | None:

@@ -7,10 +7,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from maasi_filter.arrays import FloatArray
-from maasi_filter.colours import robot_colours
+from maasi_filter.colours import OPEN, VISITED, robot_colours
 from maasi_planner.buildings.preplanning import CoveragePlan
 
-OBJECT, OBSTACLE, OPEN, VISITED = '#B9B9C9', '#8A8478', '#D55E00', '#56B4E9'
+OBJECT, OBSTACLE = '#B9B9C9', '#8A8478'
 _SIDES = ((0, 1, 3, 2), (4, 5, 7, 6), (0, 1, 5, 4), (2, 3, 7, 6), (0, 2, 6, 4), (1, 3, 7, 5))
 
 

@@ -7,10 +7,10 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from maasi_filter.arrays import FloatArray
-from maasi_filter.colours import robot_colours
+from maasi_filter.colours import OPEN, VISITED, robot_colours
 from maasi_filter.wording import counted, number
 from maasi_sim.run.buildings.observer import CuboidRecord, build_cuboid_report
-from maasi_sim.run.buildings.picture import OBJECT, OBSTACLE, OPEN, VISITED
+from maasi_sim.run.buildings.picture import OBJECT, OBSTACLE
 from maasi_sim.run.report_files import reason_of_end
 from maasi_sim.run.report_panels import MARGIN, MapView, draw_report
 

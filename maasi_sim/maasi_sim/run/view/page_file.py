@@ -1,6 +1,7 @@
 """The page of a run as one HTML file: without a run for live views, or with a run inside."""
 
 import contextlib
+import json
 import os
 import re
 import sys
@@ -8,6 +9,7 @@ import webbrowser
 from functools import cache
 from pathlib import Path
 
+from maasi_filter import colours
 from maasi_sim.run.run_folder import write_text
 from maasi_sim.run.view.event_log import LARGEST, EventLog
 
@@ -37,7 +39,9 @@ def _page() -> str:
     text, style, *modules = ((FOLDER / name).read_text(encoding='utf-8') for name in names)
     # In one scope, without imports.
     script = re.sub(r'^(import .*;\n|export )', '', '\n'.join(modules), flags=re.MULTILINE)
-    return _with('SCRIPT', _with('STYLE', text, style), script)
+    named = {name: value for name, value in vars(colours).items() if name.isupper()}
+    shared = (f'const {name} = {json.dumps(value)};\n' for name, value in named.items())
+    return _with('SCRIPT', _with('STYLE', text, style), ''.join(shared) + script)
 
 
 def _with(place: str, text: str, content: str) -> str:

@@ -18,8 +18,17 @@ from matplotlib.path import Path as Outline
 from numpy.typing import ArrayLike
 
 from maasi_filter.arrays import FloatArray, ImageArray
-from maasi_filter.colours import AWAY, FOUND, KEEP_OUT, POTENTIAL, SEEN, robot_colours
-from maasi_sim.run.buildings.picture import OBJECT, OBSTACLE, OPEN, VISITED, draw_box
+from maasi_filter.colours import (
+    AWAY,
+    FOUND,
+    KEEP_OUT,
+    OPEN,
+    POTENTIAL,
+    SEEN,
+    VISITED,
+    robot_colours,
+)
+from maasi_sim.run.buildings.picture import OBJECT, OBSTACLE, draw_box
 from maasi_sim.run.report_panels import PALE, UNSEEN
 from maasi_sim.run.run_folder import write_whole
 from maasi_sim.run.view.event_log import Event, EventLog, Scene, shares

@@ -1,15 +1,7 @@
-// Colours for colour-blind readers (Okabe and Ito; candidates: cividis).
+// Colours for colour-blind readers (Okabe and Ito; candidates: cividis); `page_file.py` puts those
+// of `maasi_filter/colours.py` before them: FOUND and others of features, ROBOTS and NAMED.
 
-export const FOUND = '#009e73';
-export const POTENTIAL = '#e69f00';
-export const SEEN = '#cc79a7';
-export const VISITED = '#56b4e9';
-export const OPEN = '#d55e00';
-export const SIGHTED = '#c7417b';
-export const KEEP_OUT = '#8f9900';
-// Robot colours, brighter in the dark theme.
-const ROBOTS = ['#0072b2', '#b54800', '#6a3d9a', '#7a4a00', '#00707f', '#a02c6d'];
-const NAMED = { purple: '#7b3294', red: '#d62728', green: '#1f7a1f', blue: '#0072b2' };
+// Robot colours in the dark theme.
 const BRIGHT = ['#6cc0f5', '#ff9a5c', '#c9a6f0', '#d0ad7a', '#5fd3dd', '#f29ac8'];
 const BRIGHT_NAMED = { purple: '#cf9be6', red: '#ff8a8a', green: '#7bd67b', blue: '#6cc0f5' };
 const CIVIDIS = [

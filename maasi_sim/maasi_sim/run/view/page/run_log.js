@@ -1,12 +1,11 @@
 // The events of a run by kind and owner, for binary search by time.
 
-// Statuses of a robot: moving, left, run ended; and those of absent robots (unavailable, left,
-// silent).
+// Statuses of a robot.
 export const MOVING = 1;
+export const UNAVAILABLE = 5;
 export const LEFT = 6;
 export const SILENT = 7;
 export const ENDED = 8;
-const AWAY = [5, LEFT, SILENT];
 
 // Return the share of a map's letter; NaN where no target can be.
 export function shareOf(letter) {
@@ -14,12 +13,12 @@ export function shareOf(letter) {
 }
 
 export function isAway(robotEvent) {
-  return AWAY.includes(robotEvent[5]);
+  return [UNAVAILABLE, LEFT, SILENT].includes(robotEvent[5]);
 }
 
 // Whether the service stop holds a robot.
 export function isStopped(robotEvent) {
-  return robotEvent[5] === 5 && robotEvent[6].includes('stopped by the service stop');
+  return robotEvent[5] === UNAVAILABLE && robotEvent[6].includes('stopped by the service stop');
 }
 
 export class Slot {

@@ -1,6 +1,6 @@
 // Texts of a run: its headline, what robots do, and map regions.
 
-import { isAway, isStopped, ENDED, MOVING } from './run_log.js';
+import { isAway, isStopped, ENDED, MOVING, UNAVAILABLE } from './run_log.js';
 import { counted, element } from './text.js';
 
 const STATES = ['no goal', 'moving', 'goal reached', 'goal cancelled', 'goal aborted', 'unavailable', 'left', 'silent', 'run ended'];
@@ -31,7 +31,7 @@ export function stateOf(log, name, time) {
   if (!event) return 'no state received';
   const [status, reason] = [event[5], event[6]];
   // Its reason may describe its last plan.
-  if (status === 5 && hasEnded(log, time)) return 'run ended while unavailable';
+  if (status === UNAVAILABLE && hasEnded(log, time)) return 'run ended while unavailable';
   if (isStopped(event)) return 'stopped until released';
   const cuboid = log.at('cuboid', name, time);
   const mode = modeOf(log, name, time);
