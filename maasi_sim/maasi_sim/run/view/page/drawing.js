@@ -3,7 +3,7 @@
 import { KEEP_OUT, themed } from './colours.js';
 import { onEarth } from './earth.js';
 import { path } from './shapes.js';
-import { counted, element } from './text.js';
+import { button, counted, element } from './text.js';
 
 const SHAPES = { area: 'area', keep_out: 'keep-out' };
 const FILE = 'area.geojson';
@@ -25,15 +25,10 @@ export class Drawing {
       ['undo', 'Undo', () => this.undo()],
       ['save', 'Save', () => this.save()],
     ];
-    this.buttons = actions.map(([name, title, action]) => {
-      const button = element('button', '', title);
-      button.dataset.draw = name;
-      button.onclick = () => {
-        this.shapes ||= shapesOf(page.log, page.time);
-        action();
-      };
-      return button;
-    });
+    this.buttons = actions.map(([draw, title, action]) => button(title, () => {
+      this.shapes ||= shapesOf(page.log, page.time);
+      action();
+    }, { draw }));
     tools.append(...this.buttons);
   }
 
@@ -107,7 +102,7 @@ export class Drawing {
     const hint = `Corners of the ${SHAPES[this.kind]}: ${this.corners.length}. Click to add a corner; double-click or click the first corner to close.`;
     this.status.textContent = `${news} ${area}, ${counted(closed, 'keep-out zone')}. ${this.kind ? hint : ''}`;
     this.status.hidden = false;
-    for (const button of this.buttons.slice(0, 2)) button.setAttribute('aria-pressed', String(this.kind === button.dataset.draw));
+    for (const each of this.buttons.slice(0, 2)) each.setAttribute('aria-pressed', String(this.kind === each.dataset.draw));
     this.page.request();
   }
 

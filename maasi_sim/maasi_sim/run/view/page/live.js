@@ -1,7 +1,7 @@
 // A live run: its events as they arrive, and its controls if enabled.
 
 import { isStopped, RunLog } from './run_log.js';
-import { element } from './text.js';
+import { button, element } from './text.js';
 import { modeOf } from './words.js';
 
 export function follow(onLog, onEvents, onState) {
@@ -66,10 +66,7 @@ export function showControls(parent, selectedRobot) {
   answer.onclick = () => answer.replaceChildren();
   const waiting = new Set();
   for (const [command, title] of COMMANDS) {
-    const button = element('button', '', title);
-    button.dataset.command = command;
-    button.title = HINTS[command] || 'For the selected robot, or for the whole search if none is selected';
-    button.onclick = async () => {
+    const control = button(title, async () => {
       const robot = selectedRobot();
       answer.textContent = `${command} ${robot || 'all'} ...`;
       // A browser queues requests beyond six connections: a stop aborts those that it supersedes.
@@ -87,8 +84,9 @@ export function showControls(parent, selectedRobot) {
       } finally {
         waiting.delete(request);
       }
-    };
-    parent.append(button);
+    }, { command });
+    control.title = HINTS[command] || 'For the selected robot, or for the whole search if none is selected';
+    parent.append(control);
   }
   parent.append(answer);
   parent.hidden = false;

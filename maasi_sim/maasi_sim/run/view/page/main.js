@@ -12,7 +12,7 @@ import { showLog, showNumbers, showRobots } from './panels.js';
 import { showPictures } from './pictures.js';
 import { Reports } from './reports.js';
 import { RunLog, unpack } from './run_log.js';
-import { element } from './text.js';
+import { button } from './text.js';
 import { showStrips } from './strips.js';
 import { showTip, tipAt } from './tips.js';
 import { showWhy } from './why.js';
@@ -123,22 +123,17 @@ class Page {
   addLayers() {
     const layers = [['background', 'Background'], ['truth', 'Truth'], ['unseen', 'Explored'], ['left', 'Undetected targets'], ['belief', 'Potential per area'], ['view', 'Field of view'], ['ways', 'Paths'], ['clusters', 'Potential'], ['detections', 'Detections']];
     for (const [name, title] of layers) {
-      const button = element('button', '', title);
-      button.dataset.layer = name;
-      button.setAttribute('aria-pressed', String(this.map.layers[name]));
-      button.onclick = () => {
+      const layer = button(title, () => {
         this.map.layers[name] = !this.map.layers[name];
-        button.setAttribute('aria-pressed', String(this.map.layers[name]));
+        layer.setAttribute('aria-pressed', String(this.map.layers[name]));
         this.request();
-      };
-      $('layers').append(button);
+      }, { layer: name });
+      layer.setAttribute('aria-pressed', String(this.map.layers[name]));
+      $('layers').append(layer);
     }
-    const space = element('button', '', '3D');
+    const space = button('3D', () => this.setSpatial(!this.camera.spatial));
     space.id = 'space';
-    space.onclick = () => this.setSpatial(!this.camera.spatial);
-    const whole = element('button', '', 'Fit');
-    whole.onclick = () => this.fit();
-    $('layers').append(space, whole);
+    $('layers').append(space, button('Fit', () => this.fit()));
   }
 
   setSpatial(spatial) {

@@ -6,7 +6,7 @@ import { inMap, onEarth } from './earth.js';
 import { send } from './live.js';
 import { circle, path } from './shapes.js';
 import { reportsAt } from './statements.js';
-import { counted, element, number } from './text.js';
+import { button, counted, element, number } from './text.js';
 
 const TOOLS = { sighting: 'Add sighting', searched: 'Mark searched' };
 const PROMPTS = {
@@ -74,20 +74,15 @@ export class Reports {
     this.person.maxLength = 100;
     this.person.setAttribute('aria-label', 'Your name');
     section.querySelector('p').append('Statements by ', this.person);
-    this.buttons = Object.entries(TOOLS).map(([kind, title]) => {
-      const button = element('button', '', title);
-      button.dataset.report = kind;
-      button.hidden = true;
-      button.onclick = () => this.start(kind);
-      return button;
-    });
+    this.buttons = Object.entries(TOOLS).map(([report, title]) => button(title, () => this.start(report), { report }));
     tools.append(...this.buttons);
+    this.enable(false);
   }
 
   // Whether persons can state something: during a live run with controls.
   enable(enabled) {
     this.enabled = enabled;
-    for (const button of this.buttons) button.hidden = !enabled;
+    for (const tool of this.buttons) tool.hidden = !enabled;
     this.section.querySelector('p').hidden = !enabled;
     if (!enabled && this.kind) this.start(null);
   }
@@ -97,7 +92,7 @@ export class Reports {
     this.kind = this.kind === kind ? null : kind;
     this.corners = [];
     if (this.kind && this.page.drawing.kind) this.page.drawing.start(null);
-    for (const button of this.buttons) button.setAttribute('aria-pressed', String(button.dataset.report === this.kind));
+    for (const tool of this.buttons) tool.setAttribute('aria-pressed', String(tool.dataset.report === this.kind));
     this.panel.hidden = !this.kind;
     if (this.kind) this.fillPanel();
     this.changed();
@@ -135,13 +130,9 @@ export class Reports {
     };
     const written = element('label', '', `${origin ? 'latitude, longitude' : 'x, y [m]'}${this.kind === 'searched' ? '; ...' : ''} `);
     written.append(this.typed);
-    this.undo = element('button', '', 'Undo');
-    this.undo.onclick = () => this.place(this.corners.slice(0, -1));
-    this.sender = element('button', '', 'Send');
-    this.sender.dataset.report = 'send';
-    this.sender.onclick = () => this.sendPlaced();
-    const cancel = element('button', '', 'Cancel');
-    cancel.onclick = () => this.start(null);
+    this.undo = button('Undo', () => this.place(this.corners.slice(0, -1)));
+    this.sender = button('Send', () => this.sendPlaced(), { report: 'send' });
+    const cancel = button('Cancel', () => this.start(null));
     this.status = element('span', 'quiet', '');
     this.panel.replaceChildren(hint, written, ...this.inputs.map(([, label]) => label), this.sender, this.undo, cancel, this.status);
   }
@@ -225,10 +216,8 @@ export class Reports {
       const buttons = element('td', '');
       if (this.enabled) {
         for (const [title, confirmed] of [['Confirm', true], ['Reject', false]]) {
-          const button = element('button', '', title);
-          button.dataset.confirmed = String(confirmed);
-          button.onclick = () => this.send({ report: 'review_target', team: space, id, confirmed, reliability: 0 });
-          buttons.append(button, ' ');
+          const review = () => this.send({ report: 'review_target', team: space, id, confirmed, reliability: 0 });
+          buttons.append(button(title, review, { confirmed }), ' ');
         }
       }
       const where = element('td', 'text', `(${place}) m`);

@@ -7,6 +7,13 @@ export function element(tag, className, text) {
   return made;
 }
 
+// Return a button with its action and data.
+export function button(title, onclick, data = {}) {
+  const made = Object.assign(element('button', '', title), { onclick });
+  Object.assign(made.dataset, data);
+  return made;
+}
+
 // Return a number with three significant digits; padded: keep trailing zeros.
 export function number(value, padded = false) {
   if (value === null || value === undefined || Number.isNaN(value)) return '-';

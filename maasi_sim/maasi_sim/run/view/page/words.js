@@ -1,7 +1,7 @@
 // Texts of a run: its headline, what robots do, and map regions.
 
 import { isAway, isStopped, ENDED, MOVING, UNAVAILABLE } from './run_log.js';
-import { counted, element } from './text.js';
+import { button, counted, element } from './text.js';
 
 const STATES = ['no goal', 'moving', 'goal reached', 'goal cancelled', 'goal aborted', 'unavailable', 'left', 'silent', 'run ended'];
 const MODES = ['waiting for start', 'searching', 'paused', 'sent home', 'stopped'];
@@ -149,8 +149,7 @@ export function showCard(parent, log, time, onClose) {
   const title = endWords(log, time) + (measured ? `, with ${counted(measured, 'measurement')}` : '');
   if (parent.dataset.key === title) return;
   parent.dataset.key = title;
-  const close = element('button', '', 'Close');
-  close.onclick = onClose;
+  const close = button('Close', onClose);
   const rows = [['Replay', replay], ['Repeat it', command]].filter(([, text]) => text);
   parent.replaceChildren(
     element('strong', '', title),
