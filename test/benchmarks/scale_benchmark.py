@@ -18,18 +18,7 @@ from maasi_filter import (
     SensorSettings,
 )
 from maasi_filter import warm_up as warm_up_filter
-from maasi_filter.models.detection import BoxDetection
-from maasi_filter.models.sensor import Sensor
-from maasi_filter.records import Cluster
-from maasi_filter.unexplored_map import UnexploredMap
 from maasi_planner import (
-    CandidateSet,
-    CandidateSettings,
-    MotionSettings,
-    RobotState,
-    RobotView,
-    TeamView,
-    make_motion,
     make_planner,
     warm_up,
 )
@@ -58,35 +47,11 @@ def measured(call):
     return time.process_time() - start, peak() - before
 
 
-def field(number, side, candidates, corner=None, clusters=8, kind=None):
-    """Return ranging drones with a swath of 20 m in a square area that nobody has seen."""
-    rng = np.random.default_rng(number)
-    bounds = np.array([[0.0, side]] * 2)
-    grid = CandidateSettings(grid=[candidates] * 2, spacing=side / candidates)
-    motion = make_motion(MotionSettings(speed=5.0, tolerance=0.5))
-    robots = {}
-    for index in range(number):
-        place = np.array([*rng.uniform(0.0, corner or side, 2), 10.0])
-        robots[f'drone{index:03d}'] = RobotView(
-            state=RobotState.at_rest(place),
-            candidates=CandidateSet(grid, bounds, 10.0).at(place),
-            motion=motion,
-            sensor=Sensor(
-                'drone',
-                kind or BoxDetection([-10.0] * 2, [10.0] * 2, 0.95),
-                np.diag([1.0, 0.05]) ** 2,
-            ),
-            period_steps=10,
-            radius=0.3,
-        )
-    spots = [rng.uniform(0.0, side, 2) for _ in range(clusters)]
-    found = [Cluster(spot, 25.0 * np.eye(2), 5.0, 0.8) for spot in spots]
-    return TeamView(0, 0.1, robots, found, UnexploredMap(bounds, max(4.0, side / 250.0)))
-
-
 def decision(*arguments):
     """Return time and memory of the first decision of `maasi` for a field."""
-    planner, team = make_planner('maasi'), field(*arguments)
+    from planner_helpers import field_team
+
+    planner, team = make_planner('maasi'), field_team(*arguments)
     return measured(lambda: planner.decide(team))
 
 

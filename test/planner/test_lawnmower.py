@@ -4,14 +4,13 @@ import re
 
 import numpy as np
 import pytest
+from planner_helpers import area_of, follow, planning_robot
 
 from maasi_filter.geometry.area import Area
 from maasi_filter.geometry.environment import EnvironmentSettings
 from maasi_filter.models.detection import BoxDetection
-from maasi_filter.models.pose import Pose
-from maasi_filter.models.sensor import Sensor
 from maasi_filter.unexplored_map import UnexploredMap
-from maasi_planner import MotionSettings, RobotState, RobotView, TeamView, make_motion, make_planner
+from maasi_planner import RobotState, TeamView, make_planner
 from maasi_planner.endurance import Endurance, EnduranceSettings
 
 BOX = BoxDetection([-1.0, -1.0], [1.0, 1.0], 1.0, 'world')
@@ -19,21 +18,12 @@ BOX = BoxDetection([-1.0, -1.0], [1.0, 1.0], 1.0, 'world')
 
 def team_of(starts, per_metre):
     """Return a team on 20 m x 8 m; per_metre: use of a full battery by robot [1/m], or None."""
-    values = {'bounds': [[0.0, 20.0], [0.0, 8.0]]}
-    area, robots = Area(EnvironmentSettings.model_validate(values)), {}
+    area, robots = area_of(20.0, 8.0), {}
     for number, (start, use) in enumerate(zip(starts, per_metre)):
-        motion = make_motion(MotionSettings(speed=1.0), area, 0.1)
-        view = RobotView(
-            state=RobotState.at_rest([*start, 0.0]),
-            candidates=np.zeros((0, 3)),
-            motion=motion,
-            sensor=Sensor(f'robot{number}', BOX, np.diag([0.1, 0.1]) ** 2),
-            period_steps=5,
-            radius=0.1,
-        )
+        view = planning_robot(start, BOX, area)
         if use is not None:
             settings = EnduranceSettings(per_metre=use, reserve=0.1)
-            view.endurance = Endurance(settings, motion, [*start, 0.0])
+            view.endurance = Endurance(settings, view.motion, [*start, 0.0])
             view.endurance.update_charge(1.0)
         robots[f'robot{number}'] = view
     return TeamView(0, 0.1, robots, [], UnexploredMap(area, 0.25))
@@ -52,9 +42,7 @@ def mow(team, planner, most=100):
             view = team.robots[name]
             if not robot.stays:
                 waypoints[name].append(robot.waypoint[:2])
-                for place in robot.positions[::3]:
-                    team.exploration.update(view.sensor.detection, Pose.from_yaw(place, 0.0))
-                view.state = RobotState.at_rest(robot.waypoint)
+                follow(team, name, robot)
                 length = np.linalg.norm(np.diff(robot.positions, axis=0), axis=1).sum()
                 if view.endurance is not None:
                     view.endurance.update_charge(view.endurance.charge - 0.1 * length * 0.01)

@@ -7,20 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from plain_objective import plain_information_terms, plain_terms
-from planner_helpers import random_team
+from planner_helpers import field_team, random_team
 
 from maasi_filter.models.detection import BoxDetection, ExponentialDetection
-from maasi_filter.models.sensor import Sensor
-from maasi_filter.records import Cluster
-from maasi_filter.unexplored_map import UnexploredMap
 from maasi_planner import (
-    CandidateSet,
-    CandidateSettings,
-    MotionSettings,
-    RobotState,
-    RobotView,
-    TeamView,
-    make_motion,
     make_planner,
     planner_settings,
 )
@@ -173,36 +163,16 @@ def test_large_teams_choose_what_all_values_lead_to(kind):
         assert value == pytest.approx(max(tries)[1], rel=1e-6)
 
 
-def field_team(number, candidates, kind):
-    """Return ranging drones in one corner of 200 m x 200 m that nobody has seen."""
-    rng = np.random.default_rng(number)
-    bounds = np.array([[0.0, 200.0]] * 2)
-    detection = (
-        BoxDetection([-10.0] * 2, [10.0] * 2, 0.95)
-        if kind == 'box'
-        else ExponentialDetection(0.98, [15.0, 15.0])
-    )
-    grid = CandidateSettings(grid=[candidates] * 2, spacing=200.0 / candidates)
-    motion = make_motion(MotionSettings(speed=5.0, tolerance=0.5))
-    robots = {}
-    for index in range(number):
-        place = np.array([*rng.uniform(0.0, 15.0, 2), 10.0])
-        robots[f'drone{index:02d}'] = RobotView(
-            state=RobotState.at_rest(place),
-            candidates=CandidateSet(grid, bounds, 10.0).at(place),
-            motion=motion,
-            sensor=Sensor('drone', detection, np.diag([1.0, 0.05]) ** 2),
-            period_steps=10,
-            radius=0.3,
-        )
-    clusters = [Cluster(rng.uniform(0.0, 200.0, 2), 25.0 * np.eye(2), 5.0, 0.8) for _ in range(8)]
-    return TeamView(0, 0.1, robots, clusters, UnexploredMap(bounds, 4.0))
+def field_of(number, candidates, kind):
+    """Return drones in one corner of 200 m x 200 m."""
+    detection = ExponentialDetection(0.98, [15.0, 15.0]) if kind == 'exponential' else None
+    return field_team(number, 200.0, candidates, 15.0, detection=detection)
 
 
 @pytest.mark.parametrize('kind', ['box', 'exponential'])
 def test_thirty_robots_decide_jointly_in_bounded_memory(kind):
-    make_planner('maasi').decide(field_team(7, 4, kind))
-    team = field_team(30, 20, kind)
+    make_planner('maasi').decide(field_of(7, 4, kind))
+    team = field_of(30, 20, kind)
     forget_peak()
     before = peak()
     decision = make_planner('maasi').decide(team)
@@ -221,11 +191,11 @@ def test_thirty_robots_decide_jointly_in_bounded_memory(kind):
 @pytest.mark.parametrize('kind', ['box', 'exponential'])
 def test_few_candidates_cost_little(kind, monkeypatch):
     """Where memory limits the candidates of each robot, those that are best alone are enough."""
-    best = make_planner('maasi').decide(field_team(8, 10, kind)).objective
+    best = make_planner('maasi').decide(field_of(8, 10, kind)).objective
     monkeypatch.setattr(team_objective, 'MOST_ENTRIES', 100_000)
-    objective, _ = built(field_team(8, 10, kind), planner_settings())
+    objective, _ = built(field_of(8, 10, kind), planner_settings())
     assert 8 * team_objective.LEAST_KEPT <= objective.kept.sum() < 0.7 * objective.kept.size
-    few = make_planner('maasi').decide(field_team(8, 10, kind)).objective
+    few = make_planner('maasi').decide(field_of(8, 10, kind)).objective
     assert few >= 0.97 * best
 
 

@@ -2,21 +2,15 @@
 
 import numpy as np
 import pytest
+from planner_helpers import area_of, follow, planning_robot
 
-from maasi_filter.geometry.area import Area
-from maasi_filter.geometry.environment import EnvironmentSettings
 from maasi_filter.models.detection import BoxDetection, ExponentialDetection
-from maasi_filter.models.pose import Pose
 from maasi_filter.models.sensor import Sensor
 from maasi_filter.unexplored_map import UnexploredMap
 from maasi_planner import (
     CandidateSet,
     CandidateSettings,
-    MotionSettings,
-    RobotState,
-    RobotView,
     TeamView,
-    make_motion,
     make_planner,
     planner_settings,
 )
@@ -25,26 +19,13 @@ from maasi_planner.candidates import map_spacing, swath_of
 PLANNERS = ('auto', 'tour', 'maasi', 'maas', 'nearest_widest', 'lawnmower')
 
 
-def area_of(width, height, expected=12.0, **zones):
-    values = {'bounds': [[0.0, width], [0.0, height]], 'expected_targets': expected, **zones}
-    return Area(EnvironmentSettings.model_validate(values))
-
-
 def team_of(area, detections, starts, candidates, spacing=None):
     """Return a team that plans; candidates: settings of them all."""
     robots = {}
     for number, (detection, start) in enumerate(zip(detections, starts)):
-        sensor = Sensor(f'robot{number}', detection, np.diag([0.1, 0.1]) ** 2)
-        speed = min(0.5 * swath_of(sensor), 100.0)
-        motion = make_motion(MotionSettings(speed=speed), area, 0.05)
-        robots[f'robot{number}'] = RobotView(
-            state=RobotState.at_rest([*start, 0.0]),
-            candidates=CandidateSet(CandidateSettings(**candidates), area).at([*start, 0.0]),
-            motion=motion,
-            sensor=sensor,
-            period_steps=5,
-            radius=0.05,
-        )
+        speed = min(0.5 * swath_of(Sensor('robot', detection, np.eye(2))), 100.0)
+        points = CandidateSet(CandidateSettings(**candidates), area).at([*start, 0.0])
+        robots[f'robot{number}'] = planning_robot(start, detection, area, 0.05, points, speed=speed)
     usual, _ = map_spacing(area.bounds, [view.sensor for view in robots.values()])
     return TeamView(0, 0.2, robots, [], UnexploredMap(area, spacing or usual))
 
@@ -113,12 +94,9 @@ def walled(size=12.0, swath=2.0, expected=12.0):
     return team_of(area, [box], [[half, half]], grid)
 
 
-def follow(team, decision):
+def follow_all(team, decision):
     for name, robot in decision.robots.items():
-        view = team.robots[name]
-        for place in robot.positions[::3]:
-            team.exploration.update(view.sensor.detection, Pose.from_yaw(place, 0.0))
-        view.state = RobotState.at_rest(robot.waypoint)
+        follow(team, name, robot)
 
 
 @pytest.mark.parametrize('expected', [0.05, 12.0, 500.0])
@@ -128,7 +106,7 @@ def test_ground_behind_a_wall_does_not_keep_a_search_alive(name, expected):
     team, planner = walled(expected=expected), make_planner(name)
     decisions = 0
     while planner.finished(team) is None:
-        follow(team, planner.decide(team))
+        follow_all(team, planner.decide(team))
         decisions += 1
         assert decisions < 150
     assert 0.75 < team.exploration.explored_fraction() < 0.92
@@ -138,7 +116,7 @@ def test_ground_behind_a_wall_does_not_keep_a_search_alive(name, expected):
     other, again = walled(expected=3.0), make_planner(name)
     for _ in range(decisions):
         assert again.finished(other) is None
-        follow(other, again.decide(other))
+        follow_all(other, again.decide(other))
     assert again.finished(other) is not None
 
 
@@ -149,7 +127,7 @@ def test_the_share_at_which_a_tour_ends_is_set():
         team, planner = walled(), make_planner('tour', settings)
         legs = 0
         while planner.finished(team) is None:
-            follow(team, planner.decide(team))
+            follow_all(team, planner.decide(team))
             legs += 1
         lengths.append(legs)
         assert team.exploration.values[:36].mean() < share + 0.05, share
@@ -173,7 +151,7 @@ def test_a_zone_that_covers_what_is_left_leaves_it_and_the_tour_goes_on_when_it_
     team.robots['robot0'].motion.adopt_area(open_area, 0.05)
     assert planner.finished(team) is None
     for _ in range(20):
-        follow(team, planner.decide(team))
+        follow_all(team, planner.decide(team))
         if planner.finished(team) is not None:
             break
     assert exploration.explored_fraction() > 0.998 and planner.finished(team) is not None
@@ -192,7 +170,7 @@ def test_live_settings_end_a_search_earlier():
                 settings.gain_threshold, settings.mass_threshold = share, 0.7
             numbers.append(0)
             while planner.finished(team) is None:
-                follow(team, planner.decide(team))
+                follow_all(team, planner.decide(team))
                 numbers[-1] += 1
         assert 0 < numbers[1] < 0.5 * numbers[0]
     with pytest.raises(ValueError, match='gain_threshold'):

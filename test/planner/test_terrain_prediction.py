@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from planner_helpers import planning_robot
 from test_tour import fly
 
 from maasi_filter.geometry.area import Area
@@ -11,10 +12,9 @@ from maasi_filter.geometry.terrain import Terrain
 from maasi_filter.models.detection import BoxDetection, ExponentialDetection
 from maasi_filter.models.line_of_sight import probability_in_sight
 from maasi_filter.models.pose import Pose
-from maasi_filter.models.sensor import Sensor
 from maasi_filter.records import Cluster
 from maasi_filter.unexplored_map import UnexploredMap
-from maasi_planner import MotionSettings, RobotState, RobotView, TeamView, make_motion, make_planner
+from maasi_planner import RobotState, TeamView, make_planner
 from maasi_planner.measurement_schedule import expected_use
 from maasi_planner.objective import information_terms, sight
 from maasi_planner.objective.predicted_measurements import chances, planned_paths, predicted
@@ -50,14 +50,8 @@ def team_over(terrain, detection=BOX, height=0.7, spacing=0.5, seed=0):
     candidates = np.full((6, 3), height)
     candidates[:, :2] = generator.uniform(0.5, SIZE - 0.5, (6, 2))
     start = [*generator.uniform(1.0, SIZE - 1.0, 2), height]
-    view = RobotView(
-        state=RobotState.at_rest(start),
-        candidates=candidates,
-        motion=make_motion(MotionSettings(speed=1.0), None, 0.1),
-        sensor=Sensor('robot', detection, np.diag([0.1, 0.1]) ** 2),
-        period_steps=7,
-        radius=0.1,
-    )
+    view = planning_robot(start, detection, candidates=candidates)
+    view.period_steps = 7
     exploration = UnexploredMap(area, spacing)
     exploration.values[...] = generator.uniform(size=exploration.values.shape)
     return TeamView(0, 0.1, {'robot0': view}, [], exploration)

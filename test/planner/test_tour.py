@@ -4,16 +4,14 @@ import itertools
 
 import numpy as np
 import pytest
-from planner_helpers import random_team
+from planner_helpers import follow, planning_robot, random_team
 
 from maasi_filter.geometry.area import Area
 from maasi_filter.geometry.environment import EnvironmentSettings
 from maasi_filter.models.detection import BoxDetection, ExponentialDetection
-from maasi_filter.models.pose import Pose
-from maasi_filter.models.sensor import Sensor
 from maasi_filter.records import Cluster
 from maasi_filter.unexplored_map import UnexploredMap
-from maasi_planner import MotionSettings, RobotState, RobotView, TeamView, make_motion, make_planner
+from maasi_planner import TeamView, make_planner
 from maasi_planner.endurance import NOTHING_AFFORDABLE, Endurance, EnduranceSettings, Phase
 from maasi_planner.planners.base import check_decision
 from maasi_planner.planners.lattice import Lattice, passing, turned
@@ -26,18 +24,10 @@ BOX = BoxDetection([-1.0, -1.0], [1.0, 1.0], 0.98, 'world')
 
 def field(detection=BOX, starts=((1.0, 1.0, 0.0),), size=12.0, obstacles=None, arrival=0.0):
     bounds = np.array([[0.0, size]] * 2)
-    robots = {
-        f'robot{number}': RobotView(
-            state=RobotState.at_rest(start),
-            candidates=np.zeros((0, 3)),
-            motion=make_motion(MotionSettings(speed=1.0), obstacles, 0.1),
-            sensor=Sensor('robot', detection, np.diag([0.1, 0.1]) ** 2),
-            period_steps=5,
-            radius=0.1,
-            arrival_radius=arrival,
-        )
-        for number, start in enumerate(starts)
-    }
+    views = [planning_robot(start, detection, obstacles) for start in starts]
+    for view in views:
+        view.arrival_radius = arrival
+    robots = {f'robot{number}': view for number, view in enumerate(views)}
     return TeamView(0, 0.1, robots, [], UnexploredMap(bounds, size / 48.0))
 
 
@@ -48,15 +38,8 @@ def fly(planner, team, name='robot0'):
     robot = decision.robots[name]
     if robot.stays:
         return None
-    follow(team, robot, name)
+    follow(team, name, robot, 5)
     return robot.waypoint
-
-
-def follow(team, robot, name='robot0'):
-    view = team.robots[name]
-    for place in robot.positions[::5]:
-        team.exploration.update(view.sensor.detection, Pose.from_yaw(place, 0.0))
-    view.state = RobotState.at_rest(robot.waypoint)
 
 
 def test_a_box_gives_lanes_that_cover_the_area_once():
@@ -116,7 +99,7 @@ def test_others_keep_their_tours_until_a_cluster_appears():
 def test_a_decision_has_the_places_that_follow_in_their_order():
     team, planner = field(starts=((1.0, 1.0, 3.0),)), make_planner('tour')
     first = planner.decide(team).robots['robot0']
-    follow(team, first)
+    follow(team, 'robot0', first, 5)
     assert (first.tour[:, 2] == 3.0).all()
     places = [tuple(place) for place in first.tour.round(6)]
     # Straight runs are one leg, so that some are passed.

@@ -5,16 +5,14 @@ import re
 import numpy as np
 import pytest
 import shapely
+from planner_helpers import area_of, planning_robot
 from std_msgs.msg import Header
 
-from maasi_filter.geometry.area import Area
-from maasi_filter.geometry.environment import EnvironmentSettings
 from maasi_filter.models.detection import BoxDetection
-from maasi_filter.models.sensor import Sensor
 from maasi_filter.records import Cluster
 from maasi_filter.unexplored_map import UnexploredMap
 from maasi_filter.wording import point
-from maasi_planner import MotionSettings, RobotState, RobotView, TeamView, make_motion, make_planner
+from maasi_planner import TeamView, make_planner
 from maasi_planner.conversions import decision_to_ros
 from maasi_planner.planners.base import check_decision
 from maasi_sim.run.view.event_maker import EventMaker
@@ -30,21 +28,11 @@ def random_search(seed):
     for x, y in rng.uniform(6.0, 18.0, (3, 2)):
         dx, dy = rng.uniform(1.5, 6.0, 2)
         zones.append({'polygon': [[x, y], [x + dx, y], [x + dx, y + dy], [x, y + dy]]})
-    bounds = [[0.0, 26.0]] * 2
-    given = {'bounds': bounds, 'keep_outs': zones, 'expected_targets': float(rng.uniform(2, 9))}
-    area = Area(EnvironmentSettings.model_validate(given))
-    sensor = Sensor('robot', BoxDetection([-1.5, -1.5], [1.5, 1.5], 0.8, 'world'), 0.01 * np.eye(2))
+    area = area_of(26.0, 26.0, float(rng.uniform(2, 9)), keep_outs=zones)
+    detection = BoxDetection([-1.5, -1.5], [1.5, 1.5], 0.8, 'world')
     robots = {
-        name: RobotView(
-            state=RobotState.at_rest(start),
-            candidates=np.zeros((0, 3)),
-            motion=make_motion(MotionSettings(speed=1.0, clearance=0.4), area, CLEAR),
-            sensor=sensor,
-            period_steps=5,
-            radius=CLEAR,
-            arrival_radius=0.0,
-        )
-        for name, start in (('east', (25.0, 1.0, 0.0)), ('west', (1.0, 1.0, 0.0)))
+        name: planning_robot(start, detection, area, CLEAR, clearance=0.4)
+        for name, start in (('east', (25.0, 1.0)), ('west', (1.0, 1.0)))
     }
     clusters = [Cluster(np.array([4.2, 20.3]), 0.01 * np.eye(2), 0.1, 0.7)] if seed % 2 else []
     return TeamView(0, 0.1, robots, clusters, UnexploredMap(area, 0.5)), area
