@@ -206,8 +206,9 @@ def test_the_page_says_why_in_a_sentence_and_what_is_at_a_point_of_the_map(chrom
         page = shown.page
         shown.open(path.as_uri())
         assert page.evaluate('maasi.time') == 0.0 and not page.evaluate('maasi.playing')
-        heading = page.inner_text('#headline')
-        assert heading.startswith('Searching: 0 of 12 found, ') and ' goes to the ' in heading
+        shown.seek(0.5)
+        heading = "document.querySelector('#headline').textContent"
+        shown.until(f'/^Searching: 0 of 12 found, .* goes to the /.test({heading})')
         page.click(f'#robots tr[data-robot={name}]')
         shown.settle()
         assert f'expects {candidates[chosen][5]:.3g} new targets' in page.inner_text('.expects')
@@ -219,7 +220,7 @@ def test_the_page_says_why_in_a_sentence_and_what_is_at_a_point_of_the_map(chrom
         assert heads == cells
 
         assert shown.tip(*waypoint).startswith(f'candidate {chosen} at (')
-        robot = page.evaluate('maasi.log.at("robot", "mambo", 0)[3]')
+        robot = page.evaluate('maasi.log.at("robot", "mambo", 0.5)[3]')
         assert shown.tip(*robot).startswith('mambo: moving')
         page.keyboard.press('Escape')
         assert shown.tip(-0.25, 2.35) == (
