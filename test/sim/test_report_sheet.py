@@ -97,7 +97,7 @@ def test_times_are_utc_where_the_run_kept_pace_with_the_clock(tmp_path):
     log.add(facts.RobotAt(9.0, 'drone', (4.0, 5.0, 1.0, 0.0), 0.1))  # after the end
     log.close(RunEnd('time_limit', 3.0, 3.0, (), BEGAN), 3.0)
     text = text_of(log)
-    assert 'From 2026-05-04 03:02:01 UTC to 2026-05-04 03:02:04 UTC; times: UTC' in text
+    assert 'From 2026-05-04 03:02:01 UTC to 2026-05-04 03:02:04 UTC. Times are UTC' in text
     # Without an origin in metres of the map.
     assert '12.00, 34.50' in text and '03:02:02' in text and '03:02:04' in text
     assert re.search(r'drone\s+50 %\s+25 %\s+5 m', text)

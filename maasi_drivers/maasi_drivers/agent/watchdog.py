@@ -61,6 +61,7 @@ class StatePublisher:
 PERIOD = 0.1
 # Time without a first pose or a charge until a warning is logged [s].
 _PATIENCE, _CHARGE_PATIENCE = 3.0, 10.0
+_CHARGE_REMINDER = 30.0  # between two warnings that no charge is known [s]
 _DEFAULT_MINIMUM = DriverSettings.model_fields['battery_minimum'].default
 
 
@@ -107,6 +108,7 @@ class Watchdog:
                 'battery',
                 f'no battery charge for {now - self._charged_at:.0f} s: battery_minimum has '
                 'no effect',
+                _CHARGE_REMINDER,
             )
         health, silence = driver.health, driver.silence
         age, timeout = silence.length, driver.settings.odometry_timeout

@@ -284,8 +284,8 @@ def _gpx(data: bytes) -> Iterator[Row]:
                 what = 'track' if item.tag == 'trk' else 'route'
                 yield feature_row(
                     label,
-                    f'open {what}, ends {gap:.0f} m from its start, allowed are {_GAP:.0%} of its '
-                    f'length ({_GAP * length:.0f} m)',
+                    f'open {what}, ends {gap:.0f} m from its start, allowed are '
+                    f'{100.0 * _GAP:.0f} % of its length ({_GAP * length:.0f} m)',
                     name=name,
                 )
 

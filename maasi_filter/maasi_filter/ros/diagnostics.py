@@ -53,9 +53,9 @@ class ReportingNode(LifecycleNode):
         self.dropped[reason] += number
         self.warn_throttled(reason, f'dropped: {text}')
 
-    def warn_throttled(self, key: str, text: str) -> None:
-        """Warn at most every two seconds under one key."""
-        if self._is_due(key):
+    def warn_throttled(self, key: str, text: str, period: float = _LOG_PERIOD) -> None:
+        """Warn at most once in a period [s] under one key."""
+        if self._is_due(key, period):
             self.get_logger().warning(text)
 
     def tell_throttled(self, key: str, text: str) -> None:
@@ -63,9 +63,9 @@ class ReportingNode(LifecycleNode):
         if self._is_due(key):
             self.get_logger().info(text)
 
-    def _is_due(self, key: str) -> bool:
+    def _is_due(self, key: str, period: float = _LOG_PERIOD) -> bool:
         now = time.monotonic()
-        due = now - self._logged.get(key, -1e9) >= _LOG_PERIOD
+        due = now - self._logged.get(key, -1e9) >= period
         if due:
             self._logged[key] = now
         return due

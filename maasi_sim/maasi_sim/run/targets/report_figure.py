@@ -174,7 +174,7 @@ def _rows(record: RunLog) -> list[tuple[str, str]]:
             (
                 name,
                 f'{counted(report["measurements"][name], "measurement")}, '
-                f'{report["distance"][name]:.1f} m',
+                f'{number(report["distance"][name])} m travelled',
             )
             for name in report['agents'][:4]
         ),

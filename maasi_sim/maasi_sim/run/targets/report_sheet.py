@@ -20,7 +20,7 @@ from maasi_filter.geometry.area import Area
 from maasi_filter.geometry.geodesy import geodetic
 from maasi_filter.records import FoundTarget
 from maasi_filter.unexplored_map import UnexploredMap
-from maasi_filter.wording import counted
+from maasi_filter.wording import counted, number
 from maasi_sim.run.log import RunLog
 from maasi_sim.run.report_files import END_REASONS
 from maasi_sim.run.report_panels import MapView, draw_ground, draw_path, ellipse
@@ -78,15 +78,15 @@ def _clock(record: RunLog, time: float, full: bool = False) -> str:
 
 def _write_head(figure: Figure, record: RunLog, explored: UnexploredMap) -> None:
     (once, twice), size = searched_at_least(record, explored)
-    unit = 'm²' if explored.dimension == 2 else 'm³'
-    begin = 'the first step' if record.began is None else _clock(record, 0.0, full=True)
-    times = 'seconds since the first step' if record.began is None else 'UTC'
-    parts = [f'{100.0 * share:.0f} % ({_size(share * size)} {unit})' for share in (once, twice)]
+    end, dimension = _clock(record, record.end_time, full=True), explored.dimension
+    when = f'The search took {end}. Times are seconds since the first step.'
+    if record.began is not None:
+        when = f'From {_clock(record, 0.0, full=True)} to {end}. Times are UTC.'
+    parts = [f'{100.0 * x:.0f} % ({_size(x * size, dimension)})' for x in (once, twice)]
     lines = [
-        f'From {begin} to {_clock(record, record.end_time, full=True)}; times: {times}. '
-        f'Ended: {_reason(record)}.',
+        f'{when} Ended: {_reason(record)}.',
         f'{counted(len(record.found_targets), "target")} found. Searched once: {parts[0]}, '
-        f'twice: {parts[1]} of {_size(size)} {unit}. Cumulative probability of success: '
+        f'twice: {parts[1]} of {_size(size, dimension)}. Cumulative probability of success: '
         f'{100.0 * explored.explored_fraction():.1f} %.',
     ]
     _text(figure, 0.05, 0.965, f'Search report: {_plain(record.name)}', 14, weight='bold')
@@ -94,8 +94,11 @@ def _write_head(figure: Figure, record: RunLog, explored: UnexploredMap) -> None
         _text(figure, 0.05, height, line, 8)
 
 
-def _size(value: float) -> str:
-    return f'{value:,.0f}' if value >= 100.0 else f'{value:.3g}'
+def _size(value: float, dimension: int) -> str:
+    if dimension == 2 and value >= 1e3:
+        return f'{number(1e-4 * value)} ha'
+    unit = 'm²' if dimension == 2 else 'm³'
+    return f'{value:,.0f} {unit}' if value >= 100.0 else f'{value:.3g} {unit}'
 
 
 def _reason(record: RunLog) -> str:
@@ -151,10 +154,10 @@ def _write_table(
 ) -> int:
     """Write a table from a line on, columns at shares of the width; return the next line."""
     _text(axes, 0.0, line + 0.5, title, 8.5, weight='bold', va='center')
-    for number, row in enumerate([[head for _, head in heads], *rows], line + 1):
-        colour = _GREY if number == line + 1 else 'black'
+    for index, row in enumerate([[head for _, head in heads], *rows], line + 1):
+        colour = _GREY if index == line + 1 else 'black'
         for (at, _), text in zip(heads, row):
-            _text(axes, at, number + 0.5, text, color=colour, va='center')
+            _text(axes, at, index + 0.5, text, color=colour, va='center')
     return line + len(rows) + 2
 
 
@@ -175,8 +178,8 @@ def _write_found(axes: Axes, record: RunLog) -> None:
     notes = ['±: one standard deviation, in the worst direction.']
     if left := len(found) - len(rows):
         notes.insert(0, f'{left} more: see found_targets.csv')
-    for number, note in enumerate(notes):
-        _text(axes, 0.0, line + number + 0.5, note, 6.5, color=_GREY, va='center')
+    for index, note in enumerate(notes):
+        _text(axes, 0.0, line + index + 0.5, note, 6.5, color=_GREY, va='center')
 
 
 def _found_row(record: RunLog, target: FoundTarget) -> Row:

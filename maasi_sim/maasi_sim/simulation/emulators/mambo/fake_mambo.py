@@ -389,7 +389,7 @@ def main(arguments: list[str] | None = None) -> int:
         if (flying, round(10 * charge)) != said:
             said = flying, round(10 * charge)
             place = ', '.join(f'{value:.2f}' for value in fake.state.pose.position)
-            print(f'{flying.name.lower()} at {place} m, battery {charge:.0%}', flush=True)
+            print(f'{flying.name.lower()} at {place} m, battery {100.0 * charge:.0f} %', flush=True)
     fake.close()
     return 0
 
