@@ -1,6 +1,8 @@
-"""The content of a scenario whose search takes a fraction of a second."""
+"""A scenario whose search takes a fraction of a second."""
 
 from typing import Any
+
+from maasi_sim.scenario.loading import scenario_from_values
 
 SMALL_FIELD: dict[str, Any] = {
     'version': 1,
@@ -18,3 +20,8 @@ SMALL_FIELD: dict[str, Any] = {
     'planner': {'name': 'nearest_widest'},
     'limits': {'time': 15.0},
 }
+
+
+def small_field(environment):
+    """Return the scenario with another environment."""
+    return scenario_from_values({**SMALL_FIELD, 'environment': environment}, 'field')

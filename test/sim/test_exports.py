@@ -10,9 +10,8 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-import yaml
 from PIL import Image
-from small_field import SMALL_FIELD
+from small_field import small_field
 
 from maasi_filter.geometry.environment import EnvironmentSettings
 from maasi_filter.geometry.geodesy import geodetic, to_map
@@ -23,7 +22,6 @@ from maasi_sim.run.targets.exports import cot_text, gpx_text, kml_text, map_file
 from maasi_sim.run.targets.mission import TargetMission
 from maasi_sim.run.targets.report import explored_after
 from maasi_sim.run.targets.tables import found_rows, searched
-from maasi_sim.scenario.loading import load_scenario
 from maasi_sim.search import search
 
 NOW = datetime(2026, 5, 4, 3, 2, 1, tzinfo=timezone.utc)
@@ -31,16 +29,14 @@ ODD = Label('cup <a&b>', 0.5, 'tag\x00\x1b"3"\ufffe')
 
 
 @pytest.fixture(scope='module')
-def run(tmp_path_factory):
+def run():
     environment = {
         'area': [[0, 0], [60, 0], [60, 60], [0, 60]],
         'expected_targets': 2.0,
         'origin': {'latitude': 46.0, 'longitude': 23.5, 'altitude': 350.0},
         'keep_outs': [[[40, 40], [50, 40], [50, 50]]],
     }
-    path = tmp_path_factory.mktemp('field') / 'field.yaml'
-    path.write_text(yaml.safe_dump({**SMALL_FIELD, 'environment': environment}))
-    return search(load_scenario(path), 2)
+    return search(small_field(environment), 2)
 
 
 @pytest.fixture

@@ -8,7 +8,6 @@ import cv2
 import numpy as np
 import pytest
 import shapely
-import yaml
 from geometry_msgs.msg import Point
 from matplotlib.colors import to_hex
 from pymap3d import geodetic2enu
@@ -27,7 +26,7 @@ from maasi_sim.run.targets.observer import TargetObserver
 from maasi_sim.run.targets.report import build_report, target_summary
 from maasi_sim.run.targets.report_figure import plot_report
 from maasi_sim.run.topics import within
-from maasi_sim.scenario.loading import load_scenario
+from maasi_sim.scenario.loading import load_scenario, scenario_from_values
 
 TYPES = load_types()
 ROBOT = PLAIN['robots']['mambo']
@@ -115,35 +114,33 @@ def point(position):
     return Point(x=x, y=y, z=z)
 
 
-def scenario_of(tmp_path, targets, **changes):
+def scenario_of(targets, **changes):
     content = PLAIN | {
         'targets': {'positions': targets} if targets else {'count': 0},
         'robots': PLAIN['robots'] | {'second': ROBOT | {'start': [1.5, 1.5, 1.0]}},
         'filter': {'removal_distance': 0.05},
         'stop': 'all_found' if targets else 'planner_done',
     }
-    path = tmp_path / 'hand.yaml'
-    path.write_text(yaml.safe_dump(content | changes))
-    return load_scenario(path)
+    return scenario_from_values(content | changes, 'hand')
 
 
 TARGETS = [[0.5, 0.5], [1.5, 0.5], [1.0, 1.5]]
 
 
 @pytest.fixture
-def run(tmp_path):
-    return Run(scenario_of(tmp_path, TARGETS))
+def run():
+    return Run(scenario_of(TARGETS))
 
 
-def test_radius_of_scoring_and_matching_within_it(tmp_path):
+def test_radius_of_scoring_and_matching_within_it():
     # Three times the removal distance, at most half the smallest distance of two targets.
     near = [[0.0, 0.0], [0.2, 0.0], [1.0, 1.0]]
-    scenario = scenario_of(tmp_path, TARGETS)
+    scenario = scenario_of(TARGETS)
     for truth, radius in ((TARGETS, 0.15), (near, 0.1), (near[:1], 0.15), (np.zeros((0, 2)), 0.15)):
         assert scoring_radius(scenario, np.array(truth)) == pytest.approx(radius)
     with pytest.raises(ValueError, match='truth: '):
         scoring_radius(scenario, np.ones((2, 2)))
-    given = scenario_of(tmp_path, TARGETS, scoring={'radius': 0.3})
+    given = scenario_of(TARGETS, scoring={'radius': 0.3})
     assert scoring_radius(given, np.array(near)) == 0.3
     # One to one.
     scores = score([[0.5, 0.51], [0.5, 0.52], [1.5, 0.5]], TARGETS, 0.15)
@@ -206,7 +203,7 @@ def test_report_of_a_complete_run(run, tmp_path):
 def test_a_map_program_gets_ways_and_what_was_explored(tmp_path):
     origin = {'latitude': 46.0, 'longitude': 23.5, 'altitude': 350.0}
     environment = PLAIN['environment'] | {'origin': origin}
-    run = Run(scenario_of(tmp_path, TARGETS, environment=environment))
+    run = Run(scenario_of(TARGETS, environment=environment))
     way = np.array([[0.5, 0.5, 1.0], [0.5, 1.3, 1.0], [1.1, 1.3, 1.2], [1.1, 1.3, 1.2]])
     # A robot stands for a while, and each leg has a thousand states.
     legs = np.concatenate([np.linspace(*way[i : i + 2], 1000) for i in range(3)])
@@ -248,10 +245,10 @@ def test_a_map_program_gets_ways_and_what_was_explored(tmp_path):
 
 
 @pytest.fixture
-def two_filters(tmp_path):
+def two_filters():
     """Return a run of each robot, with one observer: each has its own filter."""
     planner = {'name': 'maas', 'coordination': 'independent'}
-    scenario = scenario_of(tmp_path, TARGETS, planner=planner)
+    scenario = scenario_of(TARGETS, planner=planner)
     first = Run(scenario, namespace='mambo')
     return first, Run(scenario, namespace='second', observer=first.observer)
 
@@ -353,8 +350,8 @@ def test_updates_alone_tell_what_was_found_and_refined_positions_win(run):
     assert run.observer.measurements == 3
 
 
-def test_completeness_that_is_lost_again_does_not_count(tmp_path):
-    run = Run(scenario_of(tmp_path, TARGETS[:1], stop='planner_done'))
+def test_completeness_that_is_lost_again_does_not_count():
+    run = Run(scenario_of(TARGETS[:1], stop='planner_done'))
     run.declare(0.5, [0.5, 0.5])
     for time, x in ((0.5, 0.5), (0.6, 1.9), (0.7, 0.5)):
         run.found[0].position.x = x
@@ -366,7 +363,7 @@ def test_report_without_targets_and_of_a_run_in_which_nothing_happened(run, tmp_
     report = write(run.record('interrupted', 0.0, 0.0), tmp_path)
     assert (report['true_found'], report['missed'], report['real_time_factor']) == (0, 3, None)
     assert (tmp_path / 'report.png').stat().st_size > 10_000
-    run = Run(scenario_of(tmp_path, []))
+    run = Run(scenario_of([]))
     run.decide(0.0, {'mambo': [0.5, 0.5]}, explored=0.99)
     run.update(0.5)
     report = write(run.record('planner_done', 1.0, 1.0), tmp_path)

@@ -10,8 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import yaml
-from small_field import SMALL_FIELD
+from small_field import SMALL_FIELD, small_field
 
 from maasi_filter.geometry.geodesy import OriginSettings, geodetic
 from maasi_filter.records import FoundTarget, Label
@@ -19,7 +18,6 @@ from maasi_sim.run.run_options import Options
 from maasi_sim.run.targets.mission import TargetMission
 from maasi_sim.run.targets.tables import csv_text, found_geojson, found_rows
 from maasi_sim.scenario.layering import ScenarioError
-from maasi_sim.scenario.loading import load_scenario
 from maasi_sim.search import search
 
 ORIGIN = OriginSettings(latitude=46.0, longitude=23.5, altitude=350.0)
@@ -67,24 +65,21 @@ def test_geojson_has_longitude_first():
     assert first['properties']['class_id'] == 'cup' and second['properties']['target'] is None
 
 
-def field(folder, **origin):
-    environment = {**SMALL_FIELD['environment'], 'origin': origin}
-    path = folder / 'field.yaml'
-    path.write_text(yaml.safe_dump({**SMALL_FIELD, 'environment': environment}))
-    return load_scenario(path)
+def field(**origin):
+    return small_field({**SMALL_FIELD['environment'], 'origin': origin})
 
 
-def test_nodes_have_the_origin_and_a_wrong_one_is_refused(tmp_path):
-    scenario = field(tmp_path, latitude=46.0, longitude=23.5)
+def test_nodes_have_the_origin_and_a_wrong_one_is_refused():
+    scenario = field(latitude=46.0, longitude=23.5)
     plans = TargetMission('field', scenario).plan_nodes(Options(), Path('/s.yaml'))
     given = {plan.name: plan.parameters.get('environment.origin.latitude') for plan in plans}
     assert given['filter_node'] == given['planner_node'] == given['driver'] == 46.0
-    with pytest.raises(ScenarioError, match=r'field.yaml:.*environment.origin.latitude'):
-        field(tmp_path, latitude=146.0, longitude=23.5)
+    with pytest.raises(ScenarioError, match=r'^field: environment\.origin\.latitude'):
+        field(latitude=146.0, longitude=23.5)
 
 
-def test_data_frames_of_a_search(tmp_path, monkeypatch):
-    result = search(field(tmp_path, latitude=46.0, longitude=23.5, altitude=350.0), 2)
+def test_data_frames_of_a_search(monkeypatch):
+    result = search(field(latitude=46.0, longitude=23.5, altitude=350.0), 2)
     frame = result.to_dataframe()
     assert len(frame) == len(result.found_targets) > 0
     found = result.found_targets[0]
