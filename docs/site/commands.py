@@ -15,8 +15,8 @@ from maasi_sim.run.ending import EXIT_CODES
 PAGE = Path(__file__).resolve().parents[1] / 'commands.md'
 HEAD = """# Commands
 
-What each command does, its options and its exit codes. `./scripts/docs --write` writes this page
-from the parsers; `--help` of a command prints the same.
+This page lists what each command does, its options and its exit codes. `./scripts/docs --write`
+writes it from the parsers; `--help` of a command prints the same.
 
 """
 SCRIPTS = {

@@ -24,10 +24,11 @@ from maasi_sim.scenario.schema import Scenario
 PAGE = Path(__file__).resolve().parents[1] / 'scenario_keys.md'
 HEAD = """# Keys of a scenario file
 
-Written by `./scripts/docs --write` from the settings that read the file. NAME stands for the name
-of a robot, `[]` for each entry of a list. What is *needed* has no default; a robot takes it, as all
-that it does not say, from its type, a file in `config/robots`. A default of *none*: the meaning
-says what holds then (in `filter`, the value of its preset), or nothing does.
+This page lists the keys of a scenario file; `./scripts/docs --write` writes it from the settings
+that read the file. NAME stands for the name of a robot, `[]` for each entry of a list. A key that
+is *needed* has no default. A robot takes all keys that its scenario does not give from its type,
+a file in `config/robots`. Where the default is *none*, the meaning tells what holds then (in
+`filter`, the value of the preset).
 
 """
 COLUMNS = ('key', 'type [unit]', 'default', 'allowed', 'meaning')
