@@ -391,7 +391,21 @@ def test_rasters_of_any_size_and_weight_are_taken_or_refused_by_name(tmp_path):
     area = Area(environment(area=RING, prior=prior | {'raster': str(tmp_path / 'heat.npy')}))
     north, south = area.density(np.array([[33.0, 23.0], [20.0, 5.0]]))
     assert np.isfinite(north) and north > 10.0 and south == 0.0
-    wrong = {'many.npy': '20000 x 20000 cells', 'many.png': 'scale ', 'empty.npy': 'No data'}
+    wrong = {
+        'many.npy': '20000 x 20000 cells',
+        'many.png': 'scale ',
+        'empty.npy': 'is not a complete array',
+    }
+    np.save(tmp_path / 'words.npy', np.array(['a', 'b']))
+    np.save(tmp_path / 'line.npy', np.ones(3))
+    np.save(tmp_path / 'below.npy', np.array([[1.0, -9999.0]]))
+    (tmp_path / 'text.tif').write_text('no picture')
+    wrong |= {
+        'words.npy': 'is an array of other things',
+        'line.npy': 'got 3 numbers, allowed are two axes',
+        'below.npy': 'got -9999, allowed are finite numbers from 0; if it means no data',
+        'gone.npy': 'No such file or directory$',
+    }
     with open(tmp_path / 'many.npy', 'wb') as file:
         head = {'descr': '<f8', 'fortran_order': False, 'shape': (20000, 20000)}
         np.lib.format.write_array_header_1_0(file, head)

@@ -169,6 +169,13 @@ def test_a_band_of_transparency_is_no_second_band(tmp_path):
             file.write(np.full_like(heights, 255), 2)
     fixed = {'file': str(tmp_path / 'alpha.tif'), 'unit': 'm', 'zero': 0.0}
     assert area(fixed, origin=ORIGIN).terrain.height([1.0, 1.0]) == pytest.approx(100.0)
+    ground = {'bounds': [[0.0, 40.0], [0.0, 30.0]], 'origin': ORIGIN, 'prior': fixed['file']}
+    assert read_raster(EnvironmentSettings.model_validate(ground)).values.min() > 0.5
+    (tmp_path / 'text.tif').write_text('no picture')
+    for name, words in (('text', 'is not a complete GeoTIFF'), ('gone', 'No such file')):
+        other = ground | {'prior': str(tmp_path / f'{name}.tif')}
+        with pytest.raises(ValueError, match=rf'{name}\.tif: {words}'):
+            read_raster(EnvironmentSettings.model_validate(other))
     with pytest.raises(ValueError, match=r'two\.tif: has 2 bands, allowed is one'):
         area(str(tmp_path / 'two.tif'), origin=ORIGIN)
 

@@ -134,6 +134,8 @@ def test_the_picture_shows_what_would_have_been_found(run, files):
     image = np.asarray(Image.open(io.BytesIO(files['detection_probability.png'])))
     a, d, b, e, c, f = map(float, files['detection_probability.pgw'].split())
     origin = run.scenario.environment.origin
+    # Programs of others refuse rotated rasters.
+    assert d == b == 0.0
     for place in ([10.0, 12.0], [30.0, 5.0], [55.0, 55.0]):
         latitude, longitude = geodetic(np.array([place]), origin)[0, :2]
         column, row = np.linalg.solve([[a, b], [d, e]], [longitude - c, latitude - f])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -52,12 +53,19 @@ def read_raster(environment: EnvironmentSettings) -> Raster:
             values = _read_array(path) if suffix == '.npy' else read_image(path, band)
             extent = environment.prior.extent or environment.bounds[:2]
             raster = _over(np.asarray(values, dtype=float), extent)
-    except (OSError, ValueError, TypeError, EOFError) as error:
+    except OSError as error:
+        raise ValueError(f'{key}: {error.strerror or "cannot be read"}') from None
+    except ValueError as error:
         raise ValueError(f'{key}: {error}') from None
     values = raster.values
-    if values.ndim != 2 or not np.isfinite(values).all() or (values < 0.0).any():
+    if values.ndim != 2 or not values.size:
+        size = ' x '.join(map(str, values.shape))
+        raise ValueError(f'{key}: got {size} numbers, allowed are two axes, rows and columns')
+    wrong = values[~(np.isfinite(values) & (values >= 0.0))]
+    if wrong.size:
         raise ValueError(
-            f'{key}: got shape {values.shape}, allowed are two axes of finite numbers from 0'
+            f'{key}: got {wrong[0]:g}, allowed are finite numbers from 0; if it means no data, '
+            'use 0 or, in a GeoTIFF, declare it: gdal_edit.py -a_nodata'
         )
     return dataclasses.replace(raster, values=scaled(values))
 
@@ -69,11 +77,17 @@ def scaled(values: FloatArray) -> FloatArray:
 
 def _read_array(path: str) -> FloatArray:
     """Return the array of a .npy file after a check of its header."""
-    array = np.load(path, mmap_mode='r')
+    try:
+        array = np.load(path, mmap_mode='r')
+    except (ValueError, EOFError):
+        raise ValueError('is not a complete array of numbers') from None
     if not isinstance(array, np.ndarray):
         raise ValueError('holds several arrays, allowed is one')
     check_pixels(array.shape)
-    return np.array(array, dtype=float)
+    try:
+        return np.array(array, dtype=float)
+    except (ValueError, TypeError):
+        raise ValueError('is an array of other things than numbers') from None
 
 
 def _over(values: FloatArray, extent: list[list[float]]) -> Raster:
@@ -84,6 +98,12 @@ def _over(values: FloatArray, extent: list[list[float]]) -> Raster:
         return (x - west) / (east - west) * columns, (north - y) / (north - south) * rows
 
     return Raster(values, cells)
+
+
+def data_bands(file: Any) -> list[int]:
+    """Return the numbers of the bands with data of a file of rasterio: all but alpha bands."""
+    kinds = zip(file.indexes, file.colorinterp)
+    return [number for number, kind in kinds if kind.name != 'alpha']
 
 
 def scaled_band(file: Any, band: int, unknown: float) -> FloatArray:
@@ -102,20 +122,34 @@ def _of_geotiff(path: str, origin: OriginSettings | None, band: str | None) -> R
         raise ValueError('needs rasterio, the extra geo: pip install "rasterio>=1.4"') from None
     if origin is None:
         raise ValueError('a GeoTIFF needs environment.origin')
-    with rasterio.open(path) as file:
-        if file.crs is None:
-            raise ValueError('has no coordinate system')
-        check_pixels(file.shape)
-        bands = [str(number) for number in file.indexes]
-        if band not in (None, *bands) or (band is None and len(bands) > 1):
-            read = 'several' if band is None else band
-            raise ValueError(f'band: read {read}, allowed are {", ".join(bands)}')
-        crs, grid = file.crs, list(~file.transform)
-        a, b, c, d, e, f = list(file.transform)[:6]
-        u, v = np.transpose(_CORNERS) * [[file.width], [file.height]]
-        ends = a * u + b * v + c, d * u + e * v + f
-        corners = to_map(np.array(transform(crs, 'EPSG:4326', *ends)).T, origin)
-        values = scaled_band(file, int(band or 1), 0.0)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter('ignore', rasterio.errors.NotGeoreferencedWarning)
+            file = rasterio.open(path)
+        with file:
+            return _of_open_file(file, origin, band, transform)
+    except rasterio.errors.RasterioError:
+        if not Path(path).is_file():
+            raise ValueError('No such file or directory') from None
+        raise ValueError('is not a complete GeoTIFF') from None
+
+
+def _of_open_file(
+    file: Any, origin: OriginSettings, band: str | None, transform: Callable[..., Any]
+) -> Raster:
+    if file.crs is None:
+        raise ValueError('has no coordinate system')
+    check_pixels(file.shape)
+    bands = [str(number) for number in data_bands(file)]
+    if band not in (None, *bands) or (band is None and len(bands) > 1):
+        read = 'several' if band is None else band
+        raise ValueError(f'band: read {read}, allowed are {", ".join(bands)}')
+    crs, grid = file.crs, list(~file.transform)
+    a, b, c, d, e, f = list(file.transform)[:6]
+    u, v = np.transpose(_CORNERS) * [[file.width], [file.height]]
+    ends = a * u + b * v + c, d * u + e * v + f
+    corners = to_map(np.array(transform(crs, 'EPSG:4326', *ends)).T, origin)
+    values = scaled_band(file, int(band or bands[0]), 0.0)
 
     def cells(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
         degrees = geodetic(np.stack([x.ravel(), y.ravel()], axis=1), origin)

@@ -18,7 +18,7 @@ from maasi_filter.geometry.geodesy import OriginSettings, geodetic
 from maasi_filter.geometry.map_files import encoding_of
 from maasi_filter.geometry.occupancy_map import check_pixels
 from maasi_filter.geometry.polygons import short
-from maasi_filter.geometry.raster import scaled_band
+from maasi_filter.geometry.raster import data_bands, scaled_band
 from maasi_filter.geometry.terrain import Terrain
 
 _GEOTIFF = '.tif', '.tiff'
@@ -242,9 +242,7 @@ def _of_rasterio(path: str, origin: OriginSettings, bounds: FloatArray) -> _Grid
         with file:
             if file.crs is None:
                 raise ValueError('has no coordinate system: add it with gdal_translate -a_srs')
-            # Where an alpha band is 0, there is no data.
-            alpha = rasterio.enums.ColorInterp.alpha
-            bands = [band for band in file.indexes if file.colorinterp[band - 1] != alpha]
+            bands = data_bands(file)
             if len(bands) != 1:
                 raise ValueError(f'has {len(bands)} bands, allowed is one with heights')
             check_pixels(file.shape)

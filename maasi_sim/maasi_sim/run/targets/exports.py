@@ -31,6 +31,7 @@ _COLOURS = {
 }
 _NAMES = {'explored': 'Searched ground', 'area': 'Search area', 'keep_out': 'Keep-out'}
 _STALE = timedelta(days=1)  # until TAK greys a target out
+_TURNED = 0.1  # rotation of a raster that is neglected, at its ends [pixels]
 _UNKNOWN = '9999999.0'  # of errors, in Cursor on Target
 # What XML cannot contain.
 _INVALID = re.compile('[^\t\n\r\u0020-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]')
@@ -276,6 +277,10 @@ def probability_rasters(explored: UnexploredMap, origin: OriginSettings) -> dict
     degrees = geodetic(positions, origin)[:, 1::-1]
     factors = np.column_stack([column.ravel(), row.ravel(), np.ones(column.size)])
     plane = np.asarray(np.linalg.lstsq(factors, degrees, rcond=None)[0], dtype=float)
+    # Many programs refuse rotated rasters; near the origin this one is rotated by rounding only.
+    turned = np.abs([plane[0, 1] / plane[1, 1] * len(x), plane[1, 0] / plane[0, 0] * len(y)])
+    if (turned < _TURNED).all():
+        plane[0, 1] = plane[1, 0] = 0.0
     files: dict[str, str | bytes] = {
         'detection_probability.png': cv2.imencode('.png', pixels)[1].tobytes(),
         'detection_probability.pgw': ''.join(f'{value:.12f}\n' for value in plane.ravel()),
