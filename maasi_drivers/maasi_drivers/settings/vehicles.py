@@ -156,8 +156,8 @@ class MavlinkSettings(DelayedFlightSettings):
     )
     origin: Literal['local', 'here'] = Field(
         'local',
-        description="Located at the start in the map: the autopilot's local origin, or (here) the "
-        'vehicle at its first position, until the autopilot is restarted',
+        description="What is at `start` in the map: the origin of the autopilot's local frame, or "
+        '(here) the first position of the vehicle after the autopilot was switched on',
     )
     map_yaw: Finite = Field(
         0.0, description='Direction of the x axis of the map, anticlockwise from east [rad]'
@@ -199,7 +199,7 @@ class MavlinkSettings(DelayedFlightSettings):
         'land',
         description='Action when the driver ends: hold its position or land; a submarine surfaces',
     )
-    on_low_battery: Ending = Field('land', description='Action on a low battery, as at_end')
+    on_low_battery: Ending = Field('land', description='Action on a low battery, like at_end')
 
     @model_validator(mode='after')
     def _consistent(self) -> MavlinkSettings:
@@ -230,8 +230,8 @@ class PlatformSettings(FlightSettings):
         1.0,
         ge=0.4,
         le=5.0,
-        description='Flight time to the positions that it is sent to: without another one it '
-        'stops there [s]',
+        description='How far ahead the driver sends positions, as a flight time; the drone stops '
+        'at the last one [s]',
     )
     voltages: Vector2 = Field(
         [3.7, 4.2],

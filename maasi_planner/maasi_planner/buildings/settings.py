@@ -133,7 +133,7 @@ class SearcherSettings(Settings):
         default_factory=DynamicsSettings, description='Dynamics of the robot'
     )
     hazard: HazardSettings = Field(
-        default_factory=HazardSettings, description='Failures of its battery'
+        default_factory=HazardSettings, description='Failures and recharging of its battery'
     )
 
 

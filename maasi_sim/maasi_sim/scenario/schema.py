@@ -131,7 +131,7 @@ class RobotSettings(DrivenRobot, PlannedRobotSettings):
     """A robot: the settings of its type, overridden by the scenario's."""
 
     type: str = Field(description='Name of the type: a file in config/robots')
-    description: str = Field('', description='Description')
+    description: str = Field('', description='Text that describes the robot')
     driver: Annotated[str, DRIVERS, AfterValidator(DRIVERS.check_known)] = Field(
         description='Its driver: an executable of maasi_drivers, or your own module:Class'
     )

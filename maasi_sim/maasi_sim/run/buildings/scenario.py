@@ -26,11 +26,11 @@ class SearchRobotSettings(SearcherSettings):
     """A robot: the settings of its type, overridden by the scenario's."""
 
     type: str = Field(description='Name of the type: a file in config/robots')
-    description: str = Field('', description='Description')
+    description: str = Field('', description='Text that describes the robot')
     link: Literal['topics'] = Field(
         'topics', description='How its planner connects to it; the robot is simulated'
     )
-    dynamics: DynamicsSettings = Field(description='Radius of its body')
+    dynamics: DynamicsSettings = Field(description='Mass, force and speed of the robot')
     odometry: OdometrySettings = Field(
         default_factory=OdometrySettings, description='Errors of its simulated odometry'
     )

@@ -16,15 +16,15 @@ class AutopilotSettings(Settings):
         'PX4, or a real vehicle; in a scenario, autopilot: external',
     )
     firmware: Literal['arducopter', 'ardusub', 'px4'] = Field(
-        'arducopter', description='Whose behaviour it has'
+        'arducopter', description='Autopilot that is emulated'
     )
-    system: int = Field(1, ge=1, le=255, description='Its system id')
-    depth: NotNegative = Field(0.0, description='Of a submarine when it is switched on [m]')
-    estimator_time: NotNegative = Field(2.0, description='Until its position estimate is ready [s]')
+    system: int = Field(1, ge=1, le=255, description='MAVLink system id')
+    depth: NotNegative = Field(0.0, description='Depth of a submarine at its start [m]')
+    estimator_time: NotNegative = Field(2.0, description='Time without position estimate [s]')
     second_gnss: bool = Field(False, description='Whether it has a second GNSS receiver')
-    noise: NotNegative = Field(0.005, description='Deviation of its reported position [m]')
+    noise: NotNegative = Field(0.005, description='Standard deviation of the reported position [m]')
     barometer_drift: Finite = Field(
-        0.0, description='Of its estimated height until it is armed [m/s]'
+        0.0, description='Drift of the estimated height until it is armed [m/s]'
     )
     more_batteries: list[Annotated[float, Field(ge=0.0, le=1.0)]] = Field(
         default_factory=list,
@@ -33,11 +33,11 @@ class AutopilotSettings(Settings):
     endurance: Positive = Field(
         1200.0, description='Time for which a full battery lasts in the air [s]'
     )
-    charge: float = Field(1.0, ge=0.0, le=1.0, description='At the start, 0 to 1')
-    speed: Positive = Field(2.0, description='Largest speed, level [m/s]')
+    charge: float = Field(1.0, ge=0.0, le=1.0, description='Charge at the start, 0 to 1')
+    speed: Positive = Field(2.0, description='Largest horizontal speed [m/s]')
     acceleration: Positive = Field(1.0, description='Largest acceleration [m/s^2]')
     parameters: dict[str, float] = Field(
-        default_factory=dict, description='Parameters of the autopilot that differ'
+        default_factory=dict, description='Parameters that differ from the defaults'
     )
 
     def all_parameters(self) -> dict[str, float]:
