@@ -1,6 +1,6 @@
 """A scenario as a world of Gazebo (SDF), and the topics that its bridge carries. Without ROS.
 
-Read in the sources of sdformat (sdf/1.9/*.sdf), ros_gz_bridge (README.md) and gz-sim (systems
+Read in the sources of sdformat (`sdf/1.9/*.sdf`), ros_gz_bridge (README.md) and gz-sim (systems
 VelocityControl: twists in the axes of the model; OdometryPublisher: poses in the world).
 """
 
