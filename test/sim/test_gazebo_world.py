@@ -4,8 +4,12 @@
 were also checked by these files as a whole. Gazebo itself did not run them.
 """
 
+import json
 import math
+import re
 import runpy
+import shlex
+import warnings
 from importlib import import_module
 from pathlib import Path
 from xml.etree import ElementTree as Xml
@@ -20,6 +24,7 @@ from numpy.testing import assert_allclose
 
 from maasi_drivers.settings.camera import CameraSettings
 from maasi_drivers.vision.camera_model import Camera
+from maasi_filter.geometry.polygons import InputWarning
 from maasi_filter.models.pose import Pose, compose
 from maasi_sim.run.run_scenario import main
 from maasi_sim.scenario.gazebo_world import bridge_file, bridge_text, world_text
@@ -245,6 +250,37 @@ def test_the_command_writes_both_files_and_says_what_differs(tmp_path, capsys):
     assert main(['field', '--write-world', str(tmp_path / 'file' / 'a.sdf')]) == 4
     with pytest.raises(SystemExit):
         main(['field', '--write-world', str(tmp_path / 'a.world')])
+
+
+def test_any_name_of_a_world_is_one_of_gazebo_and_a_command_of_a_shell(tmp_path, capsys):
+    """What the file of an area leaves out is told as a line, without the line of our source."""
+    area = {'type': 'Polygon', 'coordinates': [[[0, 0], [1e-4, 0], [1e-4, 1e-4], [0, 0]]]}
+    line = {'type': 'LineString', 'coordinates': [[0, 0], [1, 1]]}
+    rows = [{'type': 'Feature', 'properties': {}, 'geometry': shape} for shape in (area, line)]
+    (tmp_path / 'a b.geojson').write_text(
+        json.dumps({'type': 'FeatureCollection', 'features': rows})
+    )
+    values = {**SCENARIO, 'environment': {'area': 'a b.geojson'}}
+    values['robots'] = {'bot': {**SCENARIO['robots']['bot'], 'start': [2.0, -2.0, 0.0]}}
+    file, world = tmp_path / 'a & b.yaml', tmp_path / "it's <é> & more.sdf"
+    file.write_text(yaml.safe_dump(values))
+    before = warnings.formatwarning
+    with pytest.warns(InputWarning, match='left out') as told:
+        assert main([str(file), '--write-world', str(world)]) == 0
+    text = warnings.formatwarning(told[0].message, told[0].category, 'source.py', 1)
+    assert text == f'warning: {told[0].message}\n'
+    warnings.formatwarning = before
+    said = capsys.readouterr()
+    words = shlex.split(said.out.splitlines()[-1])
+    assert words[-2:] == [f'world:={world}', f'scenario:={file}']
+    assert re.fullmatch(r'[\w-]+', Xml.parse(world).getroot().find('world').get('name'), re.ASCII)
+
+
+@pytest.mark.parametrize('name', ['ground', 'sun', 'target_1', 'obstacle_3'])
+def test_a_robot_with_the_name_of_another_part_is_refused(name):
+    robots = {name: SCENARIO['robots']['bot']}
+    with pytest.raises(ScenarioError, match=rf'robots\.{name}: read a name that the world has'):
+        world_text(made(SCENARIO | {'robots': robots}), 'arena')
 
 
 def test_measurements_of_another_program(scenario):

@@ -20,7 +20,7 @@ from maasi_sim.experiments.experiment import Case, Experiment, Outcome, Results,
 from maasi_sim.experiments.runs import DamagedRun, NoRoom, load_run, run_of, to_text, write_file
 from maasi_sim.machine import code_digest, machine_difference, this_machine
 from maasi_sim.run.progress import ProgressDisplay
-from maasi_sim.scenario.layering import ScenarioError
+from maasi_sim.scenario.layering import ScenarioError, print_warnings_plainly
 
 Item = TypeVar('Item')
 
@@ -263,6 +263,7 @@ def run_command(command: Callable[[], int]) -> int:
     def interrupt(number: int, frame: FrameType | None) -> None:
         raise KeyboardInterrupt
 
+    print_warnings_plainly()
     signal.signal(signal.SIGTERM, interrupt)
     signal.signal(signal.SIGINT, interrupt)
     try:

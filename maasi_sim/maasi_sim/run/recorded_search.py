@@ -25,7 +25,7 @@ from maasi_sim.run.targets.report_sheet import report_pdf
 from maasi_sim.run.targets.tables import csv_text, found_rows
 from maasi_sim.run.view.page_file import REPLAY, write_replay
 from maasi_sim.run.view.recording import event_log
-from maasi_sim.scenario.layering import Key, ScenarioError
+from maasi_sim.scenario.layering import Key, ScenarioError, print_warnings_plainly
 from maasi_sim.scenario.loading import load_scenario
 from maasi_sim.scenario.schema import Scenario, planner_settings
 
@@ -36,6 +36,7 @@ Placed = tuple[StampedPose, AgentMeasurement]  # pose of a robot and its measure
 def search_recording(options: Options) -> int:
     """Search a recording, print and write the found targets, and return the exit code."""
     assert options.replay is not None
+    print_warnings_plainly()
     seed, bag, topics = options.seed, options.replay, dict(options.remap)
     overrides: dict[str, tuple[Key, object]] = {} if seed is None else {'--seed': (('seed',), seed)}
     loaded = load_scenario(options.scenario, overrides)

@@ -5,6 +5,7 @@ import gc
 import os
 import sys
 from pathlib import Path
+from shlex import quote
 
 from maasi_filter.ros import middleware
 from maasi_sim.run.ending import DONE, NOT_WRITTEN, WRONG_INPUT, Interruption
@@ -89,9 +90,10 @@ def write_world(options: Options, world: Path) -> int:
     from maasi_sim.run.missions import load_mission
     from maasi_sim.run.progress import ProgressDisplay
     from maasi_sim.scenario import gazebo_world
-    from maasi_sim.scenario.layering import ScenarioError
+    from maasi_sim.scenario.layering import ScenarioError, print_warnings_plainly
     from maasi_sim.scenario.schema import Scenario
 
+    print_warnings_plainly()
     display = ProgressDisplay(sys.stdout)
     try:
         scenario = load_mission(options.scenario, options.overrides()).scenario
@@ -109,7 +111,8 @@ def write_world(options: Options, world: Path) -> int:
     display.warn(*notes)
     display.say(f'{world} and {gazebo_world.bridge_file(world)}: start them by')
     display.say(
-        f'ros2 launch maasi_sim gazebo.launch.py world:={world} scenario:={options.scenario}'
+        'ros2 launch maasi_sim gazebo.launch.py '
+        f'{quote(f"world:={world}")} {quote(f"scenario:={options.scenario}")}'
     )
     return DONE
 

@@ -5,6 +5,7 @@ VelocityControl: twists in the axes of the model; OdometryPublisher: poses in th
 """
 
 import math
+import re
 from collections.abc import Sequence
 from copy import deepcopy
 from pathlib import Path
@@ -22,6 +23,7 @@ from maasi_drivers.vision.camera_model import Camera
 from maasi_filter.geometry.area import level_shape
 from maasi_filter.geometry.environment import Zone
 from maasi_sim.scenario.external import external_topics
+from maasi_sim.scenario.layering import ScenarioError
 from maasi_sim.scenario.schema import RobotSettings, Scenario
 from maasi_sim.simulation.sensors import LaserSettings
 
@@ -78,7 +80,13 @@ def world_text(scenario: Scenario, name: str) -> str:
     for number, zone in enumerate(scenario.environment.obstacles, start=1):
         _obstacle(world, f'obstacle_{number}', zone, low, high)
     _targets(world, scenario)
+    taken = {item.get('name') for item in (*world.iter('model'), light)}
     for robot_name, robot in robots.items():
+        if robot_name in taken:
+            raise ScenarioError(
+                f'robots.{robot_name}: read a name that the world has for another part, allowed '
+                'is one that is not in it: rename the robot'
+            )
         _robot(world, robot_name, robot)
     Xml.indent(root)
     return '<?xml version="1.0"?>\n' + Xml.tostring(root, encoding='unicode') + '\n'
@@ -98,15 +106,17 @@ def bridge_text(scenario: Scenario) -> str:
 
 def write_world(scenario: Scenario, world: Path) -> list[str]:
     """Write the world and, next to it, the file of its bridge; return what differs from it."""
+    # Gazebo has the name in its topics, which allow few characters.
+    text = world_text(scenario, re.sub(r'[^A-Za-z0-9_-]', '_', world.stem))
     world.parent.mkdir(parents=True, exist_ok=True)
-    world.write_text(world_text(scenario, world.stem))
-    bridge_file(world).write_text(bridge_text(scenario))
+    world.write_text(text, encoding='utf-8')
+    bridge_file(world).write_text(bridge_text(scenario), encoding='utf-8')
     notes = []
     if scenario.environment.terrain.file is not None:
         notes.append('environment.terrain: the ground of the world is flat')
     for name, robot in scenario.robots.items():
         if robot.link != 'topics':
-            notes.append(f'robots.{name}.link: read {robot.link!r}: not in the world')
+            notes.append(f"robots.{name}.link: read '{robot.link}': not in the world")
             continue
         if robot.body != 'external':
             notes.append(

@@ -2,6 +2,7 @@
 
 import re
 import typing
+import warnings
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -27,6 +28,17 @@ class ScenarioError(ValueError):
 
 class ScenarioWarning(InputWarning):
     """Valid but improbable input: names file, key and value."""
+
+
+def print_warnings_plainly() -> None:
+    """Print warnings about inputs, from now on, as lines without those of our source."""
+    usual = warnings.formatwarning
+
+    def text(message: Any, category: type[Warning], *others: Any) -> str:
+        ours = issubclass(category, InputWarning)
+        return f'warning: {message}\n' if ours else usual(message, category, *others)
+
+    warnings.formatwarning = text  # type: ignore[assignment]
 
 
 # The compiled dumper, if available, saves a third of a second.

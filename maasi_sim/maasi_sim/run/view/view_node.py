@@ -20,7 +20,7 @@ from maasi_sim.run.topics import message_class
 from maasi_sim.run.view.event_log import Scene
 from maasi_sim.run.view.live_view import RunPage
 from maasi_sim.run.view.scene import empty_scene, scene_of
-from maasi_sim.scenario.layering import ScenarioError
+from maasi_sim.scenario.layering import ScenarioError, print_warnings_plainly
 
 DONE, WRONG_INPUT = 0, 2
 _DISCOVERY = 0.5  # period of checks for new topics [s]
@@ -81,6 +81,7 @@ def main(arguments: list[str] | None = None) -> int:
     given = sys.argv[1:] if arguments is None else arguments
     options = build_parser().parse_args(remove_ros_args(['', *given])[1:])
     scene: Scene = empty_scene('live')
+    print_warnings_plainly()
     if options.scenario:
         try:
             mission = load_mission(options.scenario)
