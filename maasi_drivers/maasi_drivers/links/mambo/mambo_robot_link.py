@@ -162,8 +162,10 @@ class MamboRobotLink(RobotLink):
         phase, problem = pilot.phase, pilot.problem
         if phase is not self._phase:
             self._phase = phase
-            why = f': {problem}' if problem and phase not in _RISING else ''
-            self.driver.get_logger().info(phase.value + why)
+            text = phase.value
+            if problem and phase not in _RISING:
+                text = problem if problem.startswith(text) else f'{text}: {problem}'
+            self.driver.get_logger().info(text)
         # During take-off the current goal is kept.
         if not (problem and phase in _RISING and self.driver.follower.current is not None):
             self.driver.judge('flight', problem, 'flying: accepting goals')
