@@ -9,7 +9,6 @@ from datetime import datetime, timezone
 import numpy as np
 import pypdf
 import pytest
-import yaml
 from small_field import SMALL_FIELD
 
 from maasi_filter.geometry.area import Area
@@ -25,7 +24,7 @@ from maasi_sim.run.targets.coverage import searched_at_least, sectors
 from maasi_sim.run.targets.mission import TargetMission
 from maasi_sim.run.targets.report import explored_after
 from maasi_sim.run.targets.report_sheet import report_pdf
-from maasi_sim.scenario.loading import load_scenario
+from maasi_sim.scenario.loading import scenario_from_values
 from maasi_sim.search import search
 
 ORIGIN = {'latitude': 46.0, 'longitude': 23.5, 'altitude': 350.0}
@@ -33,20 +32,19 @@ PLACES = [20.0, 20.0], [5.0, 55.0]
 BEGAN = datetime(2026, 5, 4, 3, 2, 1, tzinfo=timezone.utc).timestamp()
 
 
-def scenario_of(folder, name='field', **environment):
+def scenario_of(**environment):
     given = {'bounds': [[0, 60], [0, 60]], 'expected_targets': 2.0} | environment
-    grid = {'grid': [4, 4, 2], 'spacing': 15.0, 'corner': [7.0, 7.0, 2.0]}
-    if len(given.get('bounds', ())) < 3:
-        grid = SMALL_FIELD['robots']['drone']['candidates']
-    robots = {'drone': {**SMALL_FIELD['robots']['drone'], 'candidates': grid}}
-    path = folder / f'{name}.yaml'
-    path.write_text(yaml.safe_dump({**SMALL_FIELD, 'environment': given, 'robots': robots}))
-    return load_scenario(path)
+    drone = SMALL_FIELD['robots']['drone']
+    if len(given['bounds']) == 3:
+        grid = {'grid': [4, 4, 2], 'spacing': 15.0, 'corner': [7.0, 7.0, 2.0]}
+        drone = {**drone, 'candidates': grid}
+    values = {**SMALL_FIELD, 'environment': given, 'robots': {'drone': drone}}
+    return scenario_from_values(values, 'field')
 
 
 @pytest.fixture(scope='module')
-def run(tmp_path_factory):
-    made = search(scenario_of(tmp_path_factory.mktemp('field'), origin=ORIGIN), 2)
+def run():
+    made = search(scenario_of(origin=ORIGIN), 2)
     made.name, made.end_time = 'field', made.steps * made.scenario.step
     return made
 
@@ -89,8 +87,8 @@ def test_found_targets_have_coordinates_and_times(run):
     assert 'seconds since the first step' in text and 'UTC' not in text
 
 
-def test_times_are_utc_where_the_run_kept_pace_with_the_clock(tmp_path):
-    log = found_log(scenario_of(tmp_path), [target(1, [12.0, 34.5]), target(2, [1.0, 2.0])])
+def test_times_are_utc_where_the_run_kept_pace_with_the_clock():
+    log = found_log(scenario_of(), [target(1, [12.0, 34.5]), target(2, [1.0, 2.0])])
     log.add(facts.RobotAt(0.0, 'drone', (1.0, 1.0, 1.0, 0.0), 0.9))
     log.add(facts.RobotAt(1.0, 'drone', (4.0, 5.0, 1.0, 0.0), 0.25))
     log.add(facts.RobotAt(2.0, 'drone', (4.0, 5.0, 1.0, 0.0), 0.5))
@@ -103,7 +101,7 @@ def test_times_are_utc_where_the_run_kept_pace_with_the_clock(tmp_path):
     assert re.search(r'drone\s+50 %\s+25 %\s+5 m', text)
 
 
-def test_the_page_does_not_depend_on_the_true_targets(run, tmp_path):
+def test_the_page_does_not_depend_on_the_true_targets(run):
     other = RunLog(run.scenario, run.seed, None, run.name)
     for fact in run.facts:
         other.add(fact)
@@ -115,13 +113,13 @@ def test_the_page_does_not_depend_on_the_true_targets(run, tmp_path):
 
 
 @pytest.mark.parametrize('seed', range(8))
-def test_any_found_target_gives_one_page(tmp_path, seed):
+def test_any_found_target_gives_one_page(seed):
     """Names that are formulas, control signs, many finds, and covariances that are not."""
     generator = np.random.default_rng(seed)
     signs = [*'$\\^_{}%&<>#a ', '\x00', '\x1b', '\n', '\ufffe', '\u4e2d', '\U0001f681', '\ud800']
     dimension = int(generator.integers(2, 4))
     bounds = [[0, 60], [0, 60], [0, 20]][:dimension]
-    made = scenario_of(tmp_path, bounds=bounds, **({'origin': ORIGIN} if seed % 2 else {}))
+    made = scenario_of(bounds=bounds, **({'origin': ORIGIN} if seed % 2 else {}))
     items = []
     for number in range(int(generator.integers(0, 80))):
         words = [''.join(generator.choice(signs, generator.integers(0, 40))) for _ in range(2)]
@@ -137,8 +135,8 @@ def test_any_found_target_gives_one_page(tmp_path, seed):
     assert ('more: see found_targets.csv' in text) == (len(items) > 27)
 
 
-def test_ground_is_searched_twice_by_another_pass_only(tmp_path):
-    log = RunLog(scenario_of(tmp_path), 1)
+def test_ground_is_searched_twice_by_another_pass_only():
+    log = RunLog(scenario_of(), 1)
     explored = explored_after(log)
     assert searched_at_least(log, explored) == ([0.0, 0.0], 3600.0)
     detection = log.scenario.robots['drone'].sensor.build('drone', 2).detection
@@ -160,29 +158,29 @@ def test_ground_is_searched_twice_by_another_pass_only(tmp_path):
     assert twice == pytest.approx(again, abs=2.0 * tolerance) and twice > 0.0
 
 
-def test_sectors_share_the_probability_of_success(run, tmp_path):
+def test_sectors_share_the_probability_of_success(run):
     explored = explored_after(run)
     parts = sectors(explored)
     assert [part.name for part in parts] == [f'{c}{r}' for r in '123' for c in 'ABC']
     assert sum(part.poa for part in parts) == pytest.approx(1.0)
     assert sum(part.pos for part in parts) == pytest.approx(explored.explored_fraction())
-    long = scenario_of(tmp_path, bounds=[[0, 180], [0, 60]])
+    long = scenario_of(bounds=[[0, 180], [0, 60]])
     assert [part.name for part in sectors(explored_after(RunLog(long, 1)))] == ['A1', 'B1', 'C1']
     # The polygons of an area of several, with the prior of each.
     first, second = ([[x, 0.0], [x + 20.0, 0.0], [x + 20.0, 30.0], [x, 30.0]] for x in (0.0, 40.0))
     area = {'type': 'MultiPolygon', 'coordinates': [[first + first[:1]], [second + second[:1]]]}
     area = {'type': 'Feature', 'geometry': area, 'properties': {'unit': 'm'}}
     prior = {'polygons': [{'polygon': second, 'weight': 3.0}], 'floor': 0.0}
-    values = scenario_of(tmp_path).environment.model_dump() | {'area': area, 'prior': prior}
+    values = scenario_of().environment.model_dump() | {'area': area, 'prior': prior}
     values.pop('bounds')
     two = UnexploredMap(Area(EnvironmentSettings.model_validate(values)), 1.0)
     assert [part.name for part in sectors(two)] == ['1', '2']
     assert [part.poa for part in sectors(two)] == pytest.approx([0.25, 0.75], abs=0.01)
 
 
-def test_statements_of_persons_count_in_the_order_of_their_times(tmp_path):
+def test_statements_of_persons_count_in_the_order_of_their_times():
     """A search of others is a measurement; a sighting leaves what was searched before it."""
-    log = RunLog(scenario_of(tmp_path), 1)
+    log = RunLog(scenario_of(), 1)
     log.end_time = 100.0
     measured(log, (20.0, 20.0))
     own = explored_after(log)
