@@ -405,6 +405,10 @@ class UnexploredMap:
         """Return the explored share of the ground, in [0, 1]; closed ground counts."""
         return 1.0 - float((self.ground * self.values).sum() / self.ground.sum())
 
+    def describe(self) -> str:
+        """Return the explored share in words."""
+        return f'{100.0 * self.explored_fraction():.1f} % of the environment is explored'
+
     def closed_share(self) -> float:
         """Return the share of the expected targets that is unseen on ground closed later."""
         closed = self._ever_open - self._open > _ROUNDING

@@ -205,10 +205,7 @@ class Coordinator:
             return
         self.homing.note_idle(step, present)
         if self.homing.exhausted:
-            explored = 100.0 * self.exploration.explored_fraction()
-            self.finished = (
-                f'{NOTHING_AFFORDABLE} ({explored:.1f} % of the environment is explored)'
-            )
+            self.finished = f'{NOTHING_AFFORDABLE} ({self.exploration.describe()})'
 
     def _view(
         self,

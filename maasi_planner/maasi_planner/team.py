@@ -95,6 +95,17 @@ class RobotView:
                 raise ValueError(f'{name}: got shape {shape}, allowed is (n, 3)')
 
     @property
+    def underway(self) -> bool:
+        """Whether it still has a path to follow."""
+        return self.remaining_path is not None and len(self.remaining_path) > 1
+
+    @property
+    def destination(self) -> FloatArray:
+        """Where its path ends or, without one, where it is, (3,) [m]."""
+        path = None if self.planning else self.remaining_path
+        return path[-1] if path is not None and len(path) else self.state.pose.position
+
+    @property
     def height(self) -> float:
         """Height of its waypoints in 2D, metres; without candidates that of the robot."""
         known = self.candidates[0] if len(self.candidates) else self.state.pose.position

@@ -80,10 +80,9 @@ class Planner(ABC):
         str or None
             The reason, for log and report.
         """
-        explored = team.exploration.explored_fraction()
-        if explored < self.settings.explored_threshold:
+        if team.exploration.explored_fraction() < self.settings.explored_threshold:
             return None
-        return self._settled(team, f'{100.0 * explored:.1f} % of the environment is explored')
+        return self._settled(team, team.exploration.describe())
 
     def searching(self, team: TeamView) -> list[str]:
         """Return the names of the robots that continue to search, in order."""

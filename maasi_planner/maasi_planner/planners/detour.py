@@ -14,9 +14,7 @@ PASSES = 'goes around robots that stand in its path'
 def others_move(team: TeamView, name: str, decision: Decision) -> bool:
     """Return whether another robot moves, or has just received a waypoint."""
     return any(not robot.stays for robot in decision.robots.values()) or any(
-        not view.planning and view.remaining_path is not None and len(view.remaining_path) > 1
-        for other, view in team.robots.items()
-        if other != name
+        not view.planning and view.underway for other, view in team.robots.items() if other != name
     )
 
 

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from maasi_filter.arrays import FloatArray
-from maasi_planner.team import RobotView, TeamView
+from maasi_planner.team import TeamView
 
 # Flights of a robot that are planned: a present flight that collects most leaves gaps, which cost
 # later ones more.
@@ -45,7 +45,7 @@ def flights_of(team: TeamView, names: list[str], points: FloatArray, pitch: floa
     d, now, later = team.dimension, [], []
     for name in names:
         view = team.robots[name]
-        here = here_or_end(view)
+        here = view.destination
         start, end, budget, full = here, here + np.nan, math.inf, math.inf
         if view.endurance is not None:
             budget, home = view.endurance.range_from(here)
@@ -62,12 +62,6 @@ def flights_of(team: TeamView, names: list[str], points: FloatArray, pitch: floa
     speeds = [team.robots[name].motion.settings.speed for name in names]
     starts, ends, budgets = (np.array([row[i] for row in rows]) for i in range(3))
     return Flights(names * number, starts, ends, budgets, np.tile(speeds, number), worths)
-
-
-def here_or_end(view: RobotView) -> FloatArray:
-    """Return where a robot is or, if it has a path, where that ends, (3,) [m]."""
-    path = None if view.planning else view.remaining_path
-    return path[-1] if path is not None and len(path) else view.state.pose.position
 
 
 def _number(now: list, later: list, points: FloatArray, pitch: float) -> int:  # type: ignore[type-arg]

@@ -110,12 +110,8 @@ class Intermittent(Planner):
         least = self.settings.gain_threshold
         if any(self._prospects[name] > least * self._most[name] for name in names):
             return None
-        explored = 100.0 * team.exploration.explored_fraction()
-        return self._settled(
-            team,
-            f'no candidate of any robot would reveal more ({explored:.1f} % of the '
-            'environment is explored)',
-        )
+        explored = team.exploration.describe()
+        return self._settled(team, f'no candidate of any robot would reveal more ({explored})')
 
 
 @njit(cache=True)

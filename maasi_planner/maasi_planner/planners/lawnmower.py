@@ -235,21 +235,16 @@ class Lawnmower(Planner):
         if self._started and not any(self._blocks) and not any(self._pending.values()):
             searching = set(self.searching(team))
             left = [names for _, names in self._too_far if not searching <= names]
-            standing = all(
-                view.remaining_path is None or len(view.remaining_path) <= 1
-                for view in team.robots.values()
-            )
-            if standing and not left:
+            if not left and not any(view.underway for view in team.robots.values()):
                 return self._reason(team)
         return super().finished(team)
 
     def _reason(self, team: TeamView) -> str:
         if not self._too_far:
             return 'all lanes of the lawnmower are complete'
-        explored = 100.0 * team.exploration.explored_fraction()
         return (
             f'all lanes of the lawnmower are complete but {len(self._too_far)}, for which a full '
-            f'battery does not suffice ({explored:.1f} % of the environment is explored)'
+            f'battery does not suffice ({team.exploration.describe()})'
         )
 
 

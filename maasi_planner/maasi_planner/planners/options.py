@@ -66,13 +66,8 @@ def waiting_places(team: TeamView) -> list[tuple[FloatArray, float]]:
     standing = list(team.taken)
     for name in team.names():
         view = team.robots[name]
-        if view.planning:
-            continue
-        if view.remaining_path is not None and len(view.remaining_path):
-            point = np.asarray(view.remaining_path[-1], dtype=float)
-        else:
-            point = np.array(view.state.pose.position)
-        standing.append((point, view.radius))
+        if not view.planning:
+            standing.append((view.destination, view.radius))
     return standing
 
 

@@ -94,11 +94,10 @@ class Tour(Planner):
         left = float((lattice.trust * lattice.unseen(team.exploration).ravel()).sum())
         if left > self.settings.gain_threshold:
             return None
-        explored = 100.0 * team.exploration.explored_fraction()
         return self._settled(
             team,
             f'no position is worth a visit: {100.0 * left:.2g} % of the expected targets are '
-            f'unseen and reachable ({explored:.1f} % of the environment is explored)',
+            f'unseen and reachable ({team.exploration.describe()})',
         )
 
     def _lattice_of(self, team: TeamView) -> Lattice:
