@@ -11,7 +11,6 @@ from maasi_drivers.links.robot_link import RobotLink
 from maasi_drivers.settings.driver import LINKS
 from maasi_drivers.vision.camera_input import CameraInput
 from maasi_filter.ros.lifecycle_node import SettingsError
-from maasi_filter.ros.run_node import run
 
 
 def _link(name: str, driver: RobotNode) -> RobotLink:
@@ -121,12 +120,3 @@ class TurtlebotDriver(AgentDriver):
             return _link(f'turtlebot_link:{kind}', driver)
 
         super().__init__({'topics': link}, CameraInput, **options)
-
-
-mambo_driver = partial(run, MamboDriver)
-mambo_onboard_driver = partial(run, MamboOnboardDriver)
-mavlink_driver = partial(run, MavlinkDriver)
-mavlink_camera_driver = partial(run, MavlinkCameraDriver)
-ranging_driver = partial(run, RangingDriver)
-camera_driver = partial(run, CameraDriver)
-turtlebot_driver = partial(run, TurtlebotDriver)

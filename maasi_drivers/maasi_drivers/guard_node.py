@@ -12,7 +12,6 @@ from maasi_drivers.links.topic_link import CommandPublisher
 from maasi_drivers.settings.driver import GuardSettings
 from maasi_filter.ros.lifecycle_node import LockstepLifecycleNode
 from maasi_filter.ros.qos import liveliness_reader
-from maasi_filter.ros.run_node import run
 from maasi_msgs.msg import AgentState
 
 _STOP_PERIOD = 0.1
@@ -126,8 +125,3 @@ class GuardNode(LockstepLifecycleNode[GuardSettings]):
         if self._last:
             command.header.stamp = deserialize_message(self._last, AgentState).header.stamp
         self._publisher.publish(command)
-
-
-def main(arguments: list[str] | None = None) -> int:
-    """Run the guard."""
-    return run(GuardNode, arguments)

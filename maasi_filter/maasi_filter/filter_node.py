@@ -33,7 +33,6 @@ from maasi_filter.ros.keep_outs import KeepOutTopic
 from maasi_filter.ros.lifecycle_node import LockstepLifecycleNode, SettingsError
 from maasi_filter.ros.node_settings import FilterNodeSettings
 from maasi_filter.ros.qos import LATCHED, RELIABLE, UPDATES
-from maasi_filter.ros.run_node import run
 from maasi_filter.settings import unsuitable_lengths
 from maasi_filter.state_file import StateFileError, write_state
 from maasi_msgs.msg import (
@@ -426,8 +425,3 @@ class FilterNode(LockstepLifecycleNode[FilterNodeSettings]):
 
 def _is_due(rate: float, now: float, last: float) -> bool:
     return rate > 0.0 and abs(now - last) >= 1.0 / rate
-
-
-def main(arguments: list[str] | None = None) -> int:
-    """Run the filter node."""
-    return run(FilterNode, arguments)

@@ -12,7 +12,7 @@ _OF_EXTRAS = ('distributed', 'matplotlib', 'setproctitle')
 
 
 def run(target: str, ros: bool = True) -> Any:
-    """Import a function, `module:name`, and return its result, the exit code."""
+    """Import a function or the class of a node, `module:name`, run it; return the exit code."""
     # Nothing has been created yet, so there is nothing to clean up. A node, and whatever has
     # to clean up, sets its own handler in `main`.
     signal.signal(signal.SIGINT, signal.SIG_DFL)
@@ -20,7 +20,10 @@ def run(target: str, ros: bool = True) -> Any:
         # To import rclpy would end the process.
         if ros and resolve_name('maasi_filter.ros.middleware:is_missing')():
             return 2
-        return resolve_name(target)()
+        found = resolve_name(target)
+        if isinstance(found, type):
+            found = partial(resolve_name('maasi_filter.ros.run_node:run'), found)
+        return found()
     except ModuleNotFoundError as error:
         missing = error.name or ''
         package = missing.partition('.')[0]
@@ -37,4 +40,4 @@ def run(target: str, ros: bool = True) -> Any:
         return 2
 
 
-filter_node = partial(run, 'maasi_filter.filter_node:main')
+filter_node = partial(run, 'maasi_filter.filter_node:FilterNode')

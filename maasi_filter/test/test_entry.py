@@ -6,22 +6,23 @@ import sys
 import maasi_filter_entry
 
 
-def test_a_script_runs_main_of_its_module(monkeypatch):
-    from maasi_filter import filter_node
+def test_a_script_runs_its_node(monkeypatch):
+    from maasi_filter.filter_node import FilterNode
+    from maasi_filter.ros import run_node
 
     monkeypatch.setattr(signal, 'signal', lambda *_: None)
-    monkeypatch.setattr(filter_node, 'main', lambda: 7)
+    monkeypatch.setattr(run_node, 'run', {FilterNode: 7}.get)
     assert maasi_filter_entry.filter_node() == 7
 
 
 def test_what_an_extra_brings_is_named_where_it_is_missing(monkeypatch, capsys):
-    from maasi_filter import filter_node
+    from maasi_filter.ros import run_node
 
-    def main():
+    def run(_):
         raise ModuleNotFoundError("No module named 'matplotlib'", name='matplotlib')
 
     monkeypatch.setattr(signal, 'signal', lambda *_: None)
-    monkeypatch.setattr(filter_node, 'main', main)
+    monkeypatch.setattr(run_node, 'run', run)
     monkeypatch.setattr(sys, 'argv', ['/opt/lib/maasi_filter/filter_node'])
     assert maasi_filter_entry.filter_node() == 2
     assert capsys.readouterr().err == (

@@ -14,7 +14,6 @@ from maasi_filter.ros.conversions import stamp_from_ros, stamp_of_step, stamp_to
 from maasi_filter.ros.keep_outs import KeepOutTopic
 from maasi_filter.ros.lifecycle_node import LockstepLifecycleNode
 from maasi_filter.ros.qos import RELIABLE
-from maasi_filter.ros.run_node import run
 from maasi_msgs.action import SearchTargets
 from maasi_msgs.msg import AgentState, LockstepDone, LockstepStep, PlanDecision
 from maasi_planner import warm_up
@@ -482,8 +481,3 @@ class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
             self._done_publisher.publish(
                 LockstepDone(node=self.get_fully_qualified_name(), step=self.planned_step)
             )
-
-
-def main(arguments: list[str] | None = None) -> int:
-    """Run the planner node."""
-    return run(PlannerNode, arguments)

@@ -4,5 +4,5 @@ from functools import partial
 
 from maasi_filter_entry import run
 
-cuboid_planner_node = partial(run, 'maasi_planner.buildings.cuboid_planner_node:main')
-planner_node = partial(run, 'maasi_planner.planner_node:main')
+cuboid_planner_node = partial(run, 'maasi_planner.buildings.cuboid_planner_node:CuboidPlannerNode')
+planner_node = partial(run, 'maasi_planner.planner_node:PlannerNode')

@@ -4,8 +4,8 @@ from functools import partial
 
 from maasi_filter_entry import run
 
-cuboid_sim_node = partial(run, 'maasi_sim.run.buildings.cuboid_sim_node:main')
-sim_node = partial(run, 'maasi_sim.simulation.sim_node:main')
+cuboid_sim_node = partial(run, 'maasi_sim.run.buildings.cuboid_sim_node:CuboidSimNode')
+sim_node = partial(run, 'maasi_sim.simulation.sim_node:SimNode')
 fake_mambo = partial(run, 'maasi_sim.simulation.emulators.mambo.fake_mambo:main', ros=False)
 fake_mavlink_vehicle = partial(
     run, 'maasi_sim.simulation.emulators.mavlink.fake_mavlink_vehicle:main', ros=False

@@ -2,9 +2,10 @@
 
 import pytest
 
-from maasi_filter.filter_node import main
+from maasi_filter.filter_node import FilterNode
 from maasi_filter.ros.node_settings import FilterNodeSettings
 from maasi_filter.ros.parameters import flatten, parameter_fields, unflatten
+from maasi_filter.ros.run_node import run
 
 CONTENT = {
     'step': 0.1,
@@ -55,7 +56,7 @@ def test_bounds_that_are_none_are_named(bounds, problem):
 
 def test_help_of_a_node_names_topics_and_parameters(capsys, monkeypatch):
     monkeypatch.setattr('sys.argv', ['filter_node', '--help'])
-    assert main() == 0
+    assert run(FilterNode) == 0
     text = capsys.readouterr().out
     assert text.startswith('usage: filter_node')
     assert '`measurement_batch` (maasi_msgs/MeasurementBatch)' in text

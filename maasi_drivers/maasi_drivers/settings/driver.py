@@ -40,7 +40,11 @@ DRIVERS = PluginGroup(
     'driver',
     'maasi_drivers.agent.agent_driver:AgentDriver',
     # Links of simulated robots.
-    {name: f'maasi_drivers.drivers:{name}' for name, has in LINKS.items() if 'topics' in has},
+    {
+        name: f'maasi_drivers.drivers:{name.title().replace("_", "")}'
+        for name, has in LINKS.items()
+        if 'topics' in has
+    },
 )
 
 

@@ -26,7 +26,6 @@ from maasi_filter.ros.conversions import (
 )
 from maasi_filter.ros.lifecycle_node import LockstepLifecycleNode, SettingsError
 from maasi_filter.ros.qos import LATCHED, LIVELINESS_PERIOD, LIVELY, RELIABLE, sensor_reader
-from maasi_filter.ros.run_node import run
 from maasi_msgs.msg import AgentState, CuboidDecision, SearchLink, SearchLinkArray
 from maasi_planner.buildings.agent import Activity, Broadcast, SearchAgent, decision_stream
 from maasi_planner.buildings.conversions import (
@@ -363,8 +362,3 @@ class CuboidPlannerNode(LockstepLifecycleNode[CuboidPlannerSettings]):
         message.pose.pose = pose_to_ros(pose)
         message.twist.linear = vector_to_ros(velocity)
         self._state_publisher.publish(message)
-
-
-def main(arguments: list[str] | None = None) -> int:
-    """Run the planner node of one robot."""
-    return run(CuboidPlannerNode, arguments)

@@ -17,7 +17,6 @@ from maasi_filter.ros.conversions import stamp_from_ros, stamp_of_step, stamp_to
 from maasi_filter.ros.lifecycle_node import LockstepLifecycleNode, SettingsError
 from maasi_filter.ros.node_settings import NodeSettings
 from maasi_filter.ros.qos import LATCHED, LATCHED_ALL, RELIABLE, SENSOR, sensor_reader
-from maasi_filter.ros.run_node import run
 from maasi_filter.settings import NotNegative, Positive
 from maasi_msgs.msg import AgentState, LockstepDone, LockstepStep
 from maasi_sim.scenario.loading import load_scenario
@@ -479,12 +478,3 @@ class SimNode(LockstepLifecycleNode[SimNodeSettings]):
         self._external_time = stamp_from_ros(message.clock)
         while self.active and 0 <= self.step < self._step_at(self._external_time):
             self._advance_freely()
-
-
-def main(arguments: list[str] | None = None) -> int:
-    """Run the simulation node."""
-    return run(SimNode, arguments)
-
-
-if __name__ == '__main__':
-    raise SystemExit(main())

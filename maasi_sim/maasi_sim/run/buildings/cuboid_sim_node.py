@@ -8,7 +8,6 @@ from std_msgs.msg import Header
 
 from maasi_filter.ros.conversions import stamp_of_step, stamp_to_ros
 from maasi_filter.ros.qos import RELIABLE
-from maasi_filter.ros.run_node import run
 from maasi_msgs.msg import SearchLink, SearchLinkArray
 from maasi_sim.run.buildings.mission import within_range
 from maasi_sim.run.buildings.scenario import load_cuboid_scenario
@@ -97,8 +96,3 @@ class CuboidSimNode(SimNode):
                     messages=[self._sent[other] for other in in_range.get(name, [])],
                 )
             )
-
-
-def main(arguments: list[str] | None = None) -> int:
-    """Run the simulation node of a search of buildings."""
-    return run(CuboidSimNode, arguments)
