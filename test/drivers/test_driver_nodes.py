@@ -385,7 +385,7 @@ def test_in_lockstep_each_step_has_a_state_and_a_command(play):
             assert_array_equal(team.command, np.zeros(4))
     expected = [AgentState.IDLE] * 3 + [AgentState.MOVING] * 2
     assert [state.goal_status for state in team.states] == expected
-    # A step and a batch can come twice: somebody was started again.
+    # A step and a batch can come twice: a program was restarted.
     team.begin_step(4)
     team.until_done(6)
     assert team.states[-1] == team.states[-2] and team.commands[-1] == team.commands[-2]

@@ -39,7 +39,7 @@ def test_north_east_down_is_east_north_up(yaw):
 def test_a_barometer_that_drifts_before_arming_does_not_keep_it_at_its_take_off(drift, home):
     play = Play(autopilot={'barometer_drift': drift, 'estimator_time': 12.0})
     play.until(lambda: play.autopilot.armed)
-    # Set by somebody else, lower than where it stands.
+    # Set by another person, lower than where it stands.
     play.autopilot._home = home
     play.fly().run(4.0)
     assert abs(play.autopilot.height_error) > 0.55 or home

@@ -146,7 +146,7 @@ def test_other_machines_need_the_whole_link(public, capsys):
     for path in ('/', '/events', '/?token=', '/?token=wrong'):
         status, text = ask(server, 'GET', path)
         assert status == 403 and 'wrong token' in text
-    # By a number or by its own name, but by no name that somebody made point here.
+    # By a number or by its own name, but by no name that others made point here.
     own = socket.gethostname()
     for host, status in (('127.0.0.1', 200), ('192.0.2.7', 200), (own, 200), ('evil.example', 403)):
         assert ask(server, 'GET', f'/?{link.query}', headers={'Host': host})[0] == status

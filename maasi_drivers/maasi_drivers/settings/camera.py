@@ -124,7 +124,7 @@ class BoxSettings(Settings):
     """How to use the boxes that a detector of another package publishes.
 
     Boxes of one object that overlap by three quarters, as two people draw them, differ by 7 to
-    14 % of their size, hence the default of `error`.
+    14 % of their size, therefore the default of `error`.
     """
 
     classes: list[str] = Field([], description='Classes (class_id) of targets; default: all')
