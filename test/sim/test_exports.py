@@ -10,18 +10,20 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
+import shapely
 from PIL import Image
+from shapely.geometry import shape
 from small_field import small_field
 
 from maasi_filter.geometry.environment import EnvironmentSettings
-from maasi_filter.geometry.geodesy import geodetic, to_map
+from maasi_filter.geometry.geodesy import OriginSettings, geodetic, to_map
 from maasi_filter.geometry.polygons import InputWarning
 from maasi_filter.geometry.raster import read_raster
 from maasi_filter.records import Label
 from maasi_sim.run.targets.exports import cot_text, gpx_text, kml_text, map_files
 from maasi_sim.run.targets.mission import TargetMission
 from maasi_sim.run.targets.report import explored_after
-from maasi_sim.run.targets.tables import found_rows, searched
+from maasi_sim.run.targets.tables import collection, cut_at_180, found_rows, searched
 from maasi_sim.search import search
 
 NOW = datetime(2026, 5, 4, 3, 2, 1, tzinfo=timezone.utc)
@@ -104,6 +106,36 @@ def test_the_area_comes_back_from_kml_and_plan(run, files, tmp_path):
         assert made.area.area == pytest.approx(3600.0, abs=0.1)
         (kept,) = made.keep_outs
         assert kept.polygon.area == pytest.approx(50.0, abs=0.01)
+
+
+@pytest.mark.parametrize('east', [180.0, -180.0, 179.9997, -179.9998])
+def test_a_search_across_180_degrees_comes_back(run, tmp_path, east):
+    """KML and GeoJSON are cut there; the raster continues beyond; fences have no larger numbers."""
+    origin, explored = OriginSettings(latitude=1.0, longitude=east), explored_after(run)
+    features = searched(run, explored, origin)
+    made = map_files('field', [], features, run.planned_paths(), explored, origin, NOW)
+    made['ways.geojson'] = collection(cut_at_180(features))
+    moved = run.scenario.environment.model_dump() | {'origin': origin.model_dump()}
+    before = EnvironmentSettings.model_validate(moved)
+    for row in json.loads(made['ways.geojson'])['features']:
+        if row['geometry']['type'] != 'LineString':
+            for part in shapely.get_parts(shape(row['geometry'])):
+                west, _, last, _ = part.bounds
+                assert -180.0 <= west <= last <= 180.0 and last - west < 0.001
+    for name in ('drone.plan', 'search.kml'):
+        (tmp_path / name).write_text(made[name])
+        with warnings.catch_warnings():
+            warnings.simplefilter('ignore', InputWarning)
+            values = {'area': str(tmp_path / name), 'origin': origin}
+            back = EnvironmentSettings.model_validate(values)
+        assert back.area.symmetric_difference(before.area).area < 0.1
+        assert back.keep_outs[0].polygon.area == pytest.approx(50.0, abs=0.01)
+    (tmp_path / 'seen.tif').write_bytes(made['detection_probability.tif'])
+    moved |= {'prior': {'raster': str(tmp_path / 'seen.tif')}}
+    read = read_raster(EnvironmentSettings.model_validate(moved)).at(*explored.nodes().T)
+    unseen = explored.unseen().ravel()
+    wanted = np.where(unseen >= 0.0, 1.0 - unseen, 0.0)
+    assert np.allclose(read * wanted.max() / read.max(), wanted, atol=1e-6)
 
 
 def test_a_plan_of_a_search_with_bounds_has_them_as_a_fence(run, tmp_path):

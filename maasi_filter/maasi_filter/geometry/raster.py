@@ -19,6 +19,9 @@ from maasi_filter.geometry.occupancy_map import check_pixels, read_image
 _CORNERS = (0, 0), (1, 0), (1, 1), (0, 1)
 
 
+Cells = Callable[[FloatArray, FloatArray], tuple[FloatArray, FloatArray]]
+
+
 @dataclass(frozen=True)
 class Raster:
     """Densities (rows, columns), and the map from x, y [m, map] to columns and rows.
@@ -27,7 +30,7 @@ class Raster:
     """
 
     values: FloatArray
-    cells: Callable[[FloatArray, FloatArray], tuple[FloatArray, FloatArray]]
+    cells: Cells
     corners: FloatArray | None = None
 
     def at(self, x: FloatArray, y: FloatArray) -> FloatArray:
@@ -113,6 +116,25 @@ def scaled_band(file: Any, band: int, unknown: float) -> FloatArray:
     return np.asarray(found.filled(unknown))
 
 
+def cells_of(file: Any, origin: OriginSettings) -> Cells:
+    """Return the map from x, y [m, map] to columns and rows of a file of rasterio."""
+    from rasterio.warp import transform
+
+    crs, (a, b, c, d, e, f) = file.crs, list(~file.transform)[:6]
+    middle, _ = file.transform * (0.5 * file.width, 0.5 * file.height)
+
+    def cells(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
+        degrees = geodetic(np.stack([x.ravel(), y.ravel()], axis=1), origin)
+        coordinates = transform('EPSG:4326', crs, degrees[:, 1], degrees[:, 0])
+        east, north = (np.reshape(axis, x.shape) for axis in coordinates)
+        if crs.is_geographic:
+            # Files across 180 degrees count on to one of the sides.
+            east = east + 360.0 * np.round((middle - east) / 360.0)
+        return a * east + b * north + c, d * east + e * north + f
+
+    return cells
+
+
 def _of_geotiff(path: str, origin: OriginSettings | None, band: str | None) -> Raster:
     """Return a band of a GeoTIFF in its own coordinates; cells without data are 0."""
     try:
@@ -144,18 +166,10 @@ def _of_open_file(
     if band not in (None, *bands) or (band is None and len(bands) > 1):
         read = 'several' if band is None else band
         raise ValueError(f'band: read {read}, allowed are {", ".join(bands)}')
-    crs, grid = file.crs, list(~file.transform)
+    crs = file.crs
     a, b, c, d, e, f = list(file.transform)[:6]
     u, v = np.transpose(_CORNERS) * [[file.width], [file.height]]
     ends = a * u + b * v + c, d * u + e * v + f
     corners = to_map(np.array(transform(crs, 'EPSG:4326', *ends)).T, origin)
     values = scaled_band(file, int(band or bands[0]), 0.0)
-
-    def cells(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
-        degrees = geodetic(np.stack([x.ravel(), y.ravel()], axis=1), origin)
-        coordinates = transform('EPSG:4326', crs, degrees[:, 1], degrees[:, 0])
-        east, north = (np.reshape(axis, x.shape) for axis in coordinates)
-        a, b, c, d, e, f = grid[:6]
-        return a * east + b * north + c, d * east + e * north + f
-
-    return Raster(values, cells, corners)
+    return Raster(values, cells_of(file, origin), corners)

@@ -14,11 +14,11 @@ import numpy as np
 
 from maasi_filter.arrays import FloatArray
 from maasi_filter.geometry.environment import EnvironmentSettings
-from maasi_filter.geometry.geodesy import OriginSettings, geodetic
+from maasi_filter.geometry.geodesy import OriginSettings
 from maasi_filter.geometry.map_files import encoding_of
 from maasi_filter.geometry.occupancy_map import check_pixels
 from maasi_filter.geometry.polygons import short
-from maasi_filter.geometry.raster import data_bands, scaled_band
+from maasi_filter.geometry.raster import cells_of, data_bands, scaled_band
 from maasi_filter.geometry.terrain import Terrain
 
 _GEOTIFF = '.tif', '.tiff'
@@ -232,7 +232,6 @@ def _of_rasterio(path: str, origin: OriginSettings, bounds: FloatArray) -> _Grid
     """
     try:
         import rasterio
-        from rasterio.warp import transform
     except ImportError:
         raise ValueError('needs rasterio, the extra geo: pip install "rasterio>=1.4"') from None
     try:
@@ -246,25 +245,16 @@ def _of_rasterio(path: str, origin: OriginSettings, bounds: FloatArray) -> _Grid
             if len(bands) != 1:
                 raise ValueError(f'has {len(bands)} bands, allowed is one with heights')
             check_pixels(file.shape)
-            crs, grid, unit = file.crs, ~file.transform, file.units[bands[0] - 1] or None
+            cells, unit = cells_of(file, origin), file.units[bands[0] - 1] or None
             values = scaled_band(file, bands[0], math.nan)
     except rasterio.errors.RasterioError:
         raise ValueError('is not a complete GeoTIFF') from None
     values[~np.isfinite(values) | (values == _NO_HEIGHT)] = np.nan
-
-    def cells(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return columns and rows of positions [m, map], from the centre of the first cell."""
-        degrees = geodetic(np.stack([x, y], axis=1), origin)
-        found = transform('EPSG:4326', crs, degrees[:, 1], degrees[:, 0])
-        east, north = np.asarray(found[0]), np.asarray(found[1])
-        column = grid.a * east + grid.b * north + grid.c
-        return column - 0.5, grid.d * east + grid.e * north + grid.f - 0.5
-
     ends = [corner.ravel() for corner in np.meshgrid(*bounds, indexing='ij')]
     column, row = cells(*ends)
     rows, columns = values.shape
-    outside = (column < -0.5 - _SPARE) | (column > columns - 0.5 + _SPARE)
-    outside |= (row < -0.5 - _SPARE) | (row > rows - 0.5 + _SPARE)
+    outside = (column < -_SPARE) | (column > columns + _SPARE)
+    outside |= (row < -_SPARE) | (row > rows + _SPARE)
     if outside.any():
         x, y = (end[outside][0] for end in ends)
         raise ValueError(
@@ -279,7 +269,9 @@ def _of_rasterio(path: str, origin: OriginSettings, bounds: FloatArray) -> _Grid
     step = span / (number - 1)
     axes = [low + gap * np.arange(count) for low, gap, count in zip(bounds[:, 0], step, number)]
     x, y = (axis.ravel() for axis in np.meshgrid(*axes, indexing='ij'))
-    heights = _between(values, *cells(x, y)).reshape(number)
+    column, row = cells(x, y)
+    # Heights are those of the centres of cells.
+    heights = _between(values, column - 0.5, row - 0.5).reshape(number)
     return _Grid(heights, bounds[:, 0].copy(), step, unit)
 
 

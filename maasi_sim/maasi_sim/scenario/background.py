@@ -16,6 +16,7 @@ import numpy as np
 from maasi_filter.arrays import FloatArray
 from maasi_filter.geometry.environment import EnvironmentSettings
 from maasi_filter.geometry.geodesy import geodetic
+from maasi_filter.geometry.raster import cells_of
 from maasi_filter.geometry.terrain_file import read_terrain
 from maasi_sim.scenario.hill_shading import hill_shading
 
@@ -24,6 +25,7 @@ _SIZE, _QUALITY, _MARGIN = 1100, 70, 0.06
 # Most pixels of an image (400 MB while reading), and longest side of a GeoTIFF as read.
 _MOST_PIXELS, _LARGEST = 100_000_000, 4000
 _LATTICE = 33  # points per axis with exact coordinates
+_NO_ORIGIN = 'needs environment.origin'
 _NEEDS = (
     'allowed are a GeoTIFF, an image with a world file (.pgw, .jgw, .wld), or '
     'background: {file: FILE, extent: [[west, east], [south, north]]} [m, map]'
@@ -176,7 +178,7 @@ def _of_image(path: str, environment: EnvironmentSettings) -> _Picture:
 def _earth(positions: FloatArray, environment: EnvironmentSettings) -> FloatArray:
     """Return longitudes and latitudes (n, 2) [degrees] of positions (n, 2) [m, map]."""
     if environment.origin is None:
-        raise ValueError('needs environment.origin')
+        raise ValueError(_NO_ORIGIN)
     return geodetic(positions, environment.origin)[:, [1, 0]]
 
 
@@ -201,7 +203,6 @@ def _of_geotiff(path: str, environment: EnvironmentSettings) -> _Picture:
     try:
         import rasterio
         from rasterio.enums import ColorInterp
-        from rasterio.warp import transform
     except ImportError:
         raise ValueError(
             'a GeoTIFF needs rasterio (extra geo): pip install "rasterio>=1.4"'
@@ -212,10 +213,12 @@ def _of_geotiff(path: str, environment: EnvironmentSettings) -> _Picture:
     with file:
         if file.crs is None:
             return _of_image(path, environment)
-        crs, grid = file.crs, np.array(~file.transform).reshape(3, 3)[:2]
+        if environment.origin is None:
+            raise ValueError(_NO_ORIGIN)
+        placed = cells_of(file, environment.origin)
         # Subsampled if large.
         size = tuple(-(-number // (1 + max(file.shape) // _LARGEST)) for number in file.shape)
-        grid = np.diag(np.divide(size[::-1], file.shape[::-1])) @ grid
+        scale = np.divide(size[::-1], file.shape[::-1])
         chosen = list(range(1, min(file.count, 3) + 1))
         bands = file.read(chosen, out_shape=(len(chosen), *size)).astype(float)
         opaque = file.dataset_mask(out_shape=size)
@@ -233,8 +236,6 @@ def _of_geotiff(path: str, environment: EnvironmentSettings) -> _Picture:
     pixels = np.dstack([*bands[:3], opaque]).astype(np.uint8)
 
     def cells(positions: FloatArray) -> FloatArray:
-        degrees = _earth(positions, environment)
-        east, north = transform('EPSG:4326', crs, degrees[:, 0], degrees[:, 1])
-        return np.stack([east, north, np.ones(len(positions))], axis=1) @ grid.T
+        return scale * np.stack(placed(*positions.T), axis=1)
 
     return _Picture(pixels, cells)

@@ -18,6 +18,7 @@ from maasi_filter.arrays import FloatArray
 from maasi_filter.geometry.geodesy import OriginSettings, geodetic
 from maasi_filter.unexplored_map import UnexploredMap
 from maasi_filter.wording import number
+from maasi_sim.run.targets.tables import cut_at_180
 
 Row = dict[str, Any]
 _TRUTH = ('target', 'error')
@@ -55,7 +56,7 @@ def map_files(
     zones = [*searched, *_bounds(searched, explored, origin)]
     plans = {f'{robot}.plan': plan_text(path, zones, origin) for robot, path in paths.items()}
     return {
-        'search.kml': kml_text(name, found, searched),
+        'search.kml': kml_text(name, found, cut_at_180(searched)),
         'found_targets.gpx': gpx_text(found),
         'found_targets.cot': cot_text(name, found, written),
         **probability_rasters(explored, origin),
@@ -275,6 +276,8 @@ def probability_rasters(explored: UnexploredMap, origin: OriginSettings) -> dict
     column, row = np.meshgrid(np.arange(len(x)), np.arange(len(y)))
     positions = np.stack([x[column.ravel()], y[::-1][row.ravel()]], axis=1)
     degrees = geodetic(positions, origin)[:, 1::-1]
+    # The raster continues beyond 180 degrees.
+    degrees[:, 0] -= 360.0 * np.round((degrees[:, 0] - origin.longitude) / 360.0)
     factors = np.column_stack([column.ravel(), row.ravel(), np.ones(column.size)])
     plane = np.asarray(np.linalg.lstsq(factors, degrees, rcond=None)[0], dtype=float)
     # Many programs refuse rotated rasters; near the origin this one is rotated by rounding only.

@@ -23,6 +23,7 @@ from maasi_sim.run.targets.report import build_report, explored_after, target_su
 from maasi_sim.run.targets.tables import (
     collection,
     csv_text,
+    cut_at_180,
     found_geojson,
     found_rows,
     searched,
@@ -100,7 +101,7 @@ class TargetMission:
         if origin is not None:
             features = searched(record, explored, origin)
             files['found_targets.geojson'] = found_geojson(rows)
-            files['ways.geojson'] = collection(features)
+            files['ways.geojson'] = collection(cut_at_180(features))
             now = datetime.now(timezone.utc)
             paths = record.planned_paths()
             made = map_files(self.name, rows, features, paths, explored, origin, now)

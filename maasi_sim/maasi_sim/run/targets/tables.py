@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import shapely
-from shapely.geometry import mapping
+from shapely.geometry import Polygon, box, mapping, shape
 from shapely.geometry.base import BaseGeometry
 
 from maasi_filter.arrays import FloatArray
@@ -118,6 +118,30 @@ def _polygon(polygon: BaseGeometry, origin: OriginSettings, properties: Row) -> 
     turned = shapely.reverse(shapely.normalize(polygon))
     placed = shapely.transform(turned, lambda points: _coordinates(points, origin)[:, :2])
     return _feature(mapping(placed), properties)
+
+
+def cut_at_180(features: Iterable[Row]) -> list[Row]:
+    """Return features whose polygons across 180 degrees of longitude are cut there (RFC 7946)."""
+    return [{**feature, 'geometry': _cut(feature['geometry'])} for feature in features]
+
+
+def _cut(geometry: Any) -> Any:
+    if geometry['type'] not in ('Polygon', 'MultiPolygon'):
+        return geometry
+    whole = shape(geometry)
+    points = shapely.get_coordinates(whole)
+    if not len(points) or np.ptp(points[:, 0]) <= 180.0:
+        return geometry
+
+    def eastern(points: FloatArray) -> FloatArray:
+        return np.stack([points[:, 0] % 360.0, points[:, 1]], axis=1).round(8)
+
+    turned = shapely.transform(whole, eastern)
+    sides = shapely.intersection(turned, [box(0, -90, 180, 90), box(180, -90, 360, 90)])
+    parts = [sides[0], shapely.transform(sides[1], lambda points: (points - [360.0, 0.0]).round(8))]
+    # What only touches 180 degrees leaves lines.
+    polygons = [item for item in shapely.get_parts(parts) if isinstance(item, Polygon)]
+    return mapping(shapely.union_all(polygons))
 
 
 def _paths(record: RunLog, origin: OriginSettings) -> Iterator[Row]:
