@@ -106,6 +106,25 @@ def test_a_walked_border_may_cross_itself_a_little(tmp_path, seed):
     )
 
 
+def test_a_track_across_180_degrees_is_closed_or_open(tmp_path):
+    """Its longitudes jump by 360 degrees, its length does not."""
+    moved = [(north, (east + 170.1 + 180.0) % 360.0 - 180.0) for north, east in FIELD]
+    assert min(east for _, east in moved) < 0.0 < max(east for _, east in moved)
+    path = written(tmp_path, 'a.gpx', gpx(track(closed(moved), 'ring')).encode())
+    with pytest.warns(InputWarning, match='across 180 degrees'):
+        assert environment(path).area.area == pytest.approx(SIZES['area'], rel=1e-3)
+    # A small loop at a corner.
+    loop = [(0.0, 0.0), (-1e-5, 1e-5), (-1e-5, -1e-5), (1e-5, 1e-5)]
+    walked = [(moved[1][0] + a, moved[1][1] + b) for a, b in loop]
+    path = written(
+        tmp_path, 'b.gpx', gpx(track(closed([moved[0], *walked, *moved[2:]]), 'b')).encode()
+    )
+    with pytest.warns(InputWarning, match='loops where it crosses itself'):
+        assert environment(path).area.area == pytest.approx(SIZES['area'], rel=1e-2)
+    path = written(tmp_path, 'c.gpx', gpx(track(moved, 'walk')).encode())
+    assert 'open track, ends 200 m from its start' in refusal(path)
+
+
 DEGREES = st.floats(1e-4, 0.5)
 
 

@@ -29,6 +29,15 @@ def geodetic(positions: FloatArray, origin: OriginSettings) -> FloatArray:
     return np.stack(pymap3d.enu2geodetic(east, north, up, *reference), axis=1)
 
 
+def continued(longitudes: FloatArray) -> FloatArray:
+    """Return longitudes (n,) [degrees] that continue beyond 180 degrees where they jump.
+
+    By whole turns, as other sums would be rounded, and rings end where they begin.
+    """
+    turns = np.round(np.diff(longitudes, prepend=longitudes[:1]) / 360.0).cumsum()
+    return np.asarray(longitudes - 360.0 * turns)
+
+
 def to_map(degrees: FloatArray, origin: OriginSettings) -> FloatArray:
     """Return positions (n, 2) [m, map] of longitudes and latitudes (n, 2) [degrees]."""
     import pymap3d

@@ -16,7 +16,7 @@ from shapely.geometry import MultiPolygon, Polygon
 from shapely.geometry.base import BaseGeometry
 
 from maasi_filter.arrays import FloatArray
-from maasi_filter.geometry.geodesy import OriginSettings, to_map
+from maasi_filter.geometry.geodesy import OriginSettings, continued, to_map
 from maasi_filter.geometry.map_files import LABEL, READERS, read_map_file, text_of
 from maasi_filter.geometry.polygons import is_wkt, short, sound, warn
 from maasi_filter.geometry.vector_files import VECTOR_FILES, read_vector_file
@@ -339,9 +339,7 @@ def _short_way(rings: Sequence[FloatArray], where: str) -> list[FloatArray]:
     if not any((np.abs(np.diff(ring[:, 0])) > 180.0).any() for ring in rings):
         return list(rings)
     warn(f'{where}: has edges longer than 180 degrees: read as an area across 180 degrees')
-    # By whole turns, as other sums would be rounded, and rings end where they begin.
-    turned = [np.round(np.diff(ring[:, 0], prepend=ring[0, 0]) / 360.0).cumsum() for ring in rings]
-    east = [ring[:, 0] - 360.0 * turn for ring, turn in zip(rings, turned)]
+    east = [continued(ring[:, 0]) for ring in rings]
     turns = [np.round((axis.mean() - east[0].mean()) / 360.0) for axis in east]
     columns = zip(east, turns, rings)
     return [np.column_stack([x - 360.0 * turn, ring[:, 1]]) for x, turn, ring in columns]

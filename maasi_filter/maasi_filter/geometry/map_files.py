@@ -25,7 +25,7 @@ import numpy as np
 import shapely
 from shapely.geometry import Polygon
 
-from maasi_filter.geometry.geodesy import OriginSettings, geodetic
+from maasi_filter.geometry.geodesy import OriginSettings, continued, geodetic
 from maasi_filter.geometry.polygons import short
 from maasi_filter.wording import counted
 
@@ -297,7 +297,8 @@ def _gpx_position(point: Element, label: str) -> list[float]:
 
 def _uncrossed(ring: list[list[float]]) -> tuple[list[list[float]], str]:
     """Return a recorded track without small loops where it crosses itself, and what is left out."""
-    whole = Polygon(ring)
+    degrees = np.array(ring)
+    whole = Polygon(np.column_stack([continued(degrees[:, 0]), degrees[:, 1]]))
     if whole.is_valid:
         return ring, ''
     parts = sorted(shapely.get_parts(shapely.make_valid(whole)), key=lambda part: -part.area)
@@ -310,7 +311,8 @@ def _uncrossed(ring: list[list[float]]) -> tuple[list[list[float]], str]:
 
 def _gap(ring: Sequence[Sequence[float]]) -> tuple[float, float]:
     """Return the distance between the ends of a track, and its length [m]."""
-    degrees = np.array(ring).reshape(-1, 2)
+    degrees = np.array(ring)
+    degrees[:, 0] = continued(degrees[:, 0])
     metres = _DEGREE * degrees * [math.cos(math.radians(degrees[0, 1])), 1.0]
     length = np.linalg.norm(np.diff(metres, axis=0), axis=1).sum()
     return float(np.linalg.norm(metres[-1] - metres[0])), float(length)
