@@ -242,8 +242,9 @@ def test_archives_and_files_without_end_are_refused(tmp_path):
     with zipfile.ZipFile(tmp_path / 'none.kmz', 'w') as archive:
         archive.writestr('picture.png', '')
     assert 'there is no .kml in it' in refusal(tmp_path / 'none.kmz')
-    written(tmp_path, 'big.poly', '1 2\n' * 6_000_000)
-    assert 'is too large' in refusal(tmp_path / 'big.poly')
+    for name in ('big.poly', 'big.geojson'):
+        written(tmp_path, name, '1 2\n' * 6_000_000)
+        assert f'{name}: is too large, allowed are 20 MB' in refusal(tmp_path / name)
     assert 'No such file' in refusal(tmp_path / 'gone.gpx')
     with pytest.raises(ValidationError, match=r'read field\.dxf, .*\.kml.*ogr2ogr'):
         environment(tmp_path / 'field.dxf')

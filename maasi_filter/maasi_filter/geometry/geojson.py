@@ -17,7 +17,7 @@ from shapely.geometry.base import BaseGeometry
 
 from maasi_filter.arrays import FloatArray
 from maasi_filter.geometry.geodesy import OriginSettings, continued, to_map
-from maasi_filter.geometry.map_files import LABEL, READERS, read_map_file, text_of
+from maasi_filter.geometry.map_files import LABEL, READERS, read_bytes, read_map_file, text_of
 from maasi_filter.geometry.polygons import is_wkt, short, sound, warn
 from maasi_filter.geometry.vector_files import VECTOR_FILES, read_vector_file
 
@@ -232,15 +232,27 @@ def _parsed(value: Any, named: bool) -> Any:
         return read_map_file(value)
     if named and Path(value).suffix.lower() in VECTOR_FILES:
         return read_vector_file(value)
+    return _json_of_file(value) if named else _json(value, short(value))
+
+
+def _json_of_file(path: str) -> Any:
     try:
-        return json.loads(text_of(Path(value).read_bytes()) if named else value)
+        text = text_of(read_bytes(path))
     except OSError as error:
-        raise ValueError(f'{value}: {error.strerror}') from None
+        raise ValueError(f'{path}: {error.strerror}') from None
     except UnicodeError:
-        raise ValueError(f'{value}: is not UTF-8 text') from None
+        raise ValueError(f'{path}: is not UTF-8 text') from None
+    except ValueError as error:
+        raise ValueError(f'{path}: {error}') from None
+    return _json(text, short(path))
+
+
+def _json(text: str, source: str) -> Any:
+    try:
+        return json.loads(text)
     except (ValueError, RecursionError) as error:
         line = f' in line {error.lineno}' if isinstance(error, json.JSONDecodeError) else ''
-        raise ValueError(f'{short(value)}: is not JSON{line}') from None
+        raise ValueError(f'{source}: is not JSON{line}') from None
 
 
 def _check_system(data: Mapping[str, Any], source: str) -> None:

@@ -61,10 +61,7 @@ _ZIP_ERRORS = (
 def read_map_file(path: str) -> Row:
     """Return a file as a GeoJSON feature collection; ValueError names the wrong element."""
     try:
-        with Path(path).open('rb') as file:
-            data = file.read(MOST_BYTES + 1)
-        check_size(data)
-        rows = [*READERS[Path(path).suffix.lower()](data)]
+        rows = [*READERS[Path(path).suffix.lower()](read_bytes(path))]
     except OSError as error:
         raise ValueError(f'{path}: {error.strerror}') from None
     except ValueError as error:
@@ -83,10 +80,13 @@ def text_of(data: bytes) -> str:
     return data.decode(encoding_of(data))
 
 
-def check_size(data: bytes) -> None:
-    """Raise ValueError if a file is too large."""
+def read_bytes(path: str) -> bytes:
+    """Return the content of a file; ValueError if it is too large."""
+    with Path(path).open('rb') as file:
+        data = file.read(MOST_BYTES + 1)
     if len(data) > MOST_BYTES:
         raise ValueError(f'is too large, allowed are {MOST_BYTES // 1_000_000} MB')
+    return data
 
 
 def feature_row(label: str, shape: str, coordinates: Any = None, **properties: Any) -> Row:

@@ -21,10 +21,10 @@ from maasi_filter.geometry.map_files import (
     MOST_BYTES,
     MOST_ELEMENTS,
     Row,
-    check_size,
     feature_row,
     point_row,
     polygons_row,
+    read_bytes,
 )
 from maasi_filter.geometry.polygons import short, warn
 from maasi_filter.wording import counted
@@ -72,10 +72,7 @@ def _pyogrio() -> ModuleType:
 
 def _geopackage(path: str) -> str:
     """Return the path of a GeoPackage; by its path, GDAL also reads what is not merged yet."""
-    with Path(path).open('rb') as file:
-        data = file.read(MOST_BYTES + 1)
-    check_size(data)
-    if not data.startswith(_SQLITE):
+    if not read_bytes(path).startswith(_SQLITE):
         raise ValueError('is not a GeoPackage')
     return str(Path(path).resolve())
 
