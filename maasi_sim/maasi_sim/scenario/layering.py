@@ -31,12 +31,16 @@ class ScenarioWarning(InputWarning):
 
 
 def print_warnings_plainly() -> None:
-    """Print warnings about inputs, from now on, as lines without those of our source."""
-    usual = warnings.formatwarning
+    """Print warnings about inputs, from now on, once and without the line of our source."""
+    usual, known = warnings.formatwarning, set[str]()
 
     def text(message: Any, category: type[Warning], *others: Any) -> str:
-        ours = issubclass(category, InputWarning)
-        return f'warning: {message}\n' if ours else usual(message, category, *others)
+        if not issubclass(category, InputWarning):
+            return usual(message, category, *others)
+        # A file is validated several times.
+        line = '' if str(message) in known else f'warning: {message}\n'
+        known.add(str(message))
+        return line
 
     warnings.formatwarning = text  # type: ignore[assignment]
 
