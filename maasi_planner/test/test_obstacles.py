@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 import shapely
-from test_motion import among
 
 from maasi_filter.geometry.area import Area
 from maasi_filter.geometry.environment import EnvironmentSettings
@@ -25,6 +24,13 @@ ROBOTS = [
     UNICYCLE,
 ]
 SPACE = {'speed': 4.0, 'tolerance': 1.0, 'clearance': 3.0}
+
+
+def among(*rows):
+    """Return an area with round obstacles: x, y, radius, or x, y, z, radius of a sphere."""
+    zones = [{'centre': list(row[:-1]), 'radius': row[-1]} for row in rows]
+    bounds = [[-1e3, 1e3]] * 3
+    return Area(EnvironmentSettings.model_validate({'bounds': bounds, 'obstacles': zones}))
 
 
 def discs(centres, radii):
