@@ -54,8 +54,8 @@ class FilterNode(LockstepLifecycleNode[FilterNodeSettings]):
     """Estimate the targets of a team by the particle PHD or the Poisson multi-Bernoulli filter.
 
     In the namespace of its only robot, the node filters for that robot alone and exchanges found
-    targets with the filters of the other robots (002, section 4). Received found targets take
-    effect in batches with a later stamp.
+    targets with the filters of the other robots. Received found targets take effect in batches
+    with a later stamp.
 
     Subscribes
     ----------

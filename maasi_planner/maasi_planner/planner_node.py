@@ -43,11 +43,11 @@ _REFUSAL_PATIENCE = 10.0  # simulated time in which every goal is refused, until
 
 
 class PlannerNode(LockstepLifecycleNode[PlannerNodeSettings]):
-    """Plan for the whole team (000, algorithms 1 and 2), or independently for one robot.
+    """Plan for the whole team, or independently for one robot.
 
-    In the namespace of its only robot, the node plans for that robot alone (002, section 4) and
-    exchanges destinations with the planners of the other robots. At each step they plan in the
-    order of names, each with the destinations of the earlier ones.
+    In the namespace of its only robot, the node plans for that robot alone and exchanges
+    destinations with the planners of the other robots. At each step they plan in the order of
+    names, each with the destinations of the earlier ones.
 
     Subscribes
     ----------

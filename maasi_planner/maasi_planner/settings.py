@@ -165,8 +165,8 @@ class MotionSettings(Settings):
     )
     obstacle_term: Literal['none', 'printed', 'away'] = Field(
         'none',
-        description='Obstacle term of paper 001 (eq. 14, 15) in place of paths around obstacles: '
-        'none, as printed, or directed away from the obstacle',
+        description='Obstacle term of real-drone exploration 2024 (eq. 14, 15) in place of paths '
+        'around obstacles: none, as printed, or directed away from the obstacle',
     )
     obstacle_distance: Positive = Field(
         0.12, description='d_l, distance to an obstacle below which the obstacle term acts [m]'
@@ -224,7 +224,7 @@ class PlannerSettings(Settings):
     )
     measurement: Literal['periodic', 'event'] = Field(
         'periodic',
-        description='Measure at every period, or only if the trigger of paper 000 (eq. 24, 33) '
+        description='Measure at every period, or only if the trigger of MAASI 2024 (eq. 24, 33) '
         'fires',
     )
     trigger: Literal['absolute', 'relative'] = Field(

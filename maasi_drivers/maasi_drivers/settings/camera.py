@@ -39,9 +39,9 @@ class SegmentationSettings(Settings):
 
     rule: Annotated[str, DETECTORS, AfterValidator(DETECTORS.check)] = Field(
         'robust',
-        description="'paper': fixed blue excess (paper 001, eq. (16)), blobs of at least "
-        "minimum_area; 'robust': adapts to light and checks size and shape; 'aruco': fiducial "
-        'markers, whose ids identify targets; or your own module:Class',
+        description="'paper': fixed blue excess (real-drone exploration 2024, eq. 16), blobs of "
+        "at least minimum_area; 'robust': adapts to light and checks size and shape; 'aruco': "
+        'fiducial markers, whose ids identify targets; or your own module:Class',
     )
     settings: Annotated[Any, _DETECTOR, AfterValidator(_DETECTOR.check)] = Field(
         None, validate_default=True, description='Settings of your own detector'
@@ -156,7 +156,8 @@ class CameraSettings(Settings):
         [260.0, 260.0],
         min_length=2,
         max_length=2,
-        description='Focal length along image x and y (beta_x, beta_y of paper 001, eq. (18)) [px]',
+        description='Focal length along image x and y (beta_x, beta_y in eq. 18 of real-drone '
+        'exploration 2024) [px]',
     )
     principal_point: list[Pixel] | None = Field(
         None,

@@ -59,7 +59,8 @@ class CuboidPlannerNode(LockstepLifecycleNode[CuboidPlannerSettings]):
     """Plan for the robot of this namespace, with the messages of robots in range.
 
     At each step the node reads the robot's state, sends it, receives messages of others, decides,
-    and commands the velocity of its plan. It does not wait for robots out of range.
+    and commands the velocity of its plan. It does not wait for robots out of range. Equations of
+    the parameters are those of cuboid search 2023 (docs/cuboid_mpc.md).
 
     Subscribes
     ----------

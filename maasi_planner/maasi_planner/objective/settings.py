@@ -12,7 +12,7 @@ class InformationSettings(JointSettings):
 
     objective: Literal['paper', 'information'] = Field(
         'information',
-        description='Terms T and E: those of paper 000 (eq. 17 to 22, 26 to 32), or information '
+        description='Terms T and E: those of MAASI 2024 (eq. 17 to 22, 26 to 32), or information '
         'gain and expected new targets of all measurements of the team together',
     )
     alpha: NotNegative = Field(0.5, description='Weight of target refinement T [1]')
@@ -34,7 +34,7 @@ class InformationSettings(JointSettings):
     own_measurement: bool = Field(
         True,
         description='Whether e in E includes the measurement at which it is evaluated, as in eq. '
-        '21 and 22 of paper 000; with pi = 1 around the robot, E is then 0',
+        '21 and 22 of MAASI 2024; with pi = 1 around the robot, E is then 0',
     )
     extension: Literal['measuring', 'silent'] = Field(
         'measuring',

@@ -41,8 +41,8 @@ class ActiveSearchSettings(JointSettings):
     horizon: int = Field(1, ge=1, le=3, description='Number of waypoints planned ahead [1]')
     agent_exploration: Literal['own', 'shared'] = Field(
         'own',
-        description='Whether e of a robot counts only its own measurements (paper 002, eq. 12, '
-        '16) or those of the whole team',
+        description='Whether e of a robot counts only its own measurements (multi-agent '
+        'exploration 2023, eq. 12, 16) or those of the whole team',
     )
     refinement: Literal['centres', 'mutual_information'] = Field(
         'centres', description='T from probabilities at cluster centres, or from mutual information'
