@@ -1,11 +1,24 @@
 """Settings as flat parameters, and back."""
 
+import math
+import re
+
 import pytest
 
+from maasi_drivers.drivers import TurtlebotDriver
 from maasi_filter.filter_node import FilterNode
+from maasi_filter.ros.lifecycle_node import LockstepLifecycleNode
 from maasi_filter.ros.node_settings import FilterNodeSettings
-from maasi_filter.ros.parameters import flatten, parameter_fields, unflatten
+from maasi_filter.ros.parameters import (
+    flatten,
+    node_help,
+    parameter_fields,
+    unflatten,
+    written,
+)
 from maasi_filter.ros.run_node import run
+from maasi_planner.planner_node import PlannerNode
+from maasi_sim.run.buildings.cuboid_sim_node import CuboidSimNode
 
 CONTENT = {
     'step': 0.1,
@@ -65,3 +78,18 @@ def test_help_of_a_node_names_topics_and_parameters(capsys, monkeypatch):
     assert 'allowed: above 0.0 and at most 10.0; default: 0.05' in text
     # What its constructor takes is for who writes code.
     assert 'lockstep_member' not in text
+
+
+@pytest.mark.parametrize('node', [FilterNode, PlannerNode, TurtlebotDriver, CuboidSimNode])
+def test_help_lists_each_section_once_and_nothing_for_programmers(node):
+    text = node_help(node, 'node', LockstepLifecycleNode)
+    titles = re.findall(r'^(.+)\n-+$', text, re.M)
+    assert len(set(titles)) == len(titles) and {'Publishes', 'ROS parameters'} <= set(titles)
+    assert not {'Parameters', 'Attributes', 'Notes'} & set(titles)
+    assert text.count('/diagnostics` (diagnostic_msgs/DiagnosticArray), each second') == 1
+    assert re.search(r'\b00[0-4]\b', text.partition('ROS parameters')[0]) is None
+
+
+def test_defaults_are_written_without_the_notation_of_python():
+    assert written([0.0, math.pi / 2.0, True, 'west']) == '[0.0, 1.5708, true, west]'
+    assert [written(value) for value in (10000, 0.25, 1e-6)] == ['10000', '0.25', '1e-06']
