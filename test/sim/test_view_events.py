@@ -312,6 +312,11 @@ def test_a_search_in_one_process_leaves_the_same_events(result):
     # As from the nodes, once a second, and not only at decisions.
     times = [event[0] for event in log.events if event[1] == 'map']
     assert np.diff(times).max() <= 2.0 and len(times) > 2 * len(plans)
+    # Charges of the battery, which falls, and statuses of the goal.
+    states = [event for event in log.events if event[1] == 'robot']
+    charges = [event[4] for event in states]
+    assert charges[0] == 1.0 and 0.0 < charges[-1] < 1.0 and max(np.diff(charges)) <= 0.0
+    assert {event[5] for event in states[:-1]} <= {0, 1, 2} and states[1][5] == 1
 
 
 def test_the_objective_is_made_of_its_terms_with_the_weights_of_the_scene(result):
