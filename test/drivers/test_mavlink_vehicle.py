@@ -5,7 +5,17 @@ from functools import partial
 
 import numpy as np
 import pytest
-from mavlink_play import ARM, AT_MOST, HEIGHTS, NOT_ARMED, TAKE_OFF, Play, mavlink
+from mavlink_play import (
+    ARM,
+    AT_MOST,
+    HEIGHTS,
+    NOT_ARMED,
+    PERIOD,
+    TAKE_OFF,
+    Play,
+    RoutingAutopilot,
+    mavlink,
+)
 from numpy.testing import assert_allclose
 
 from maasi_drivers.links.mavlink.firmware import identify
@@ -179,6 +189,34 @@ def disarmed(play):
     play.autopilot._sender.command_ack_send = lambda *_: None
     play.until(lambda: play.phase is VehiclePhase.RISING)
     play.autopilot.disarm('Disarming motors')
+
+
+@pytest.mark.parametrize('begun', [0.0, 10.0])
+def test_two_autopilots_with_one_id_are_named_once_and_not_flown(begun):
+    play = Play(permitted=False)
+    play.run(begun)
+    other = twin(play)
+    for _ in range(25):
+        play.run(1.0, before=other)
+    said = [text for _, text in play.reports if text.startswith('several autopilots answer')]
+    assert len(said) == 1 and 'as system 1' in said[0] and 'SYSID_THISMAV' in said[0]
+    assert sum('has restarted' in text for _, text in play.reports) <= 2
+    assert play.permit() == f'{said[0]}: restart the driver' and said[0] in play.fault
+    assert not play.autopilot.armed and not play.commands(ARM)
+
+
+def twin(play):
+    """Add an autopilot with the same ID that has been running longer; return its turn."""
+    other = RoutingAutopilot(
+        play.autopilot.settings,
+        mavlink.MAVLink(play.to_driver, 1, 1),
+        0.3,
+        np.random.default_rng(2),
+    )
+    other.advance(30.0)
+    first = play.autopilot.handle
+    play.autopilot.handle = lambda message: (first(message), other.handle(message))
+    return lambda: other.advance(PERIOD)
 
 
 RESTARTED = 'the autopilot has restarted: restart the driver'

@@ -3,7 +3,7 @@
 import json
 import math
 import os
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -117,6 +117,10 @@ def _host_boot() -> str:
 
 
 _RESTART = 1000  # a larger decrease of the time since boot means a restart [ms]
+_RESTARTS, _ALTERNATING = (
+    3,
+    3.0,
+)  # more in this time are not one autopilot's: to boot takes longer [s]
 _FIX_3D = 3  # smallest fix type of GPS_RAW_INT with a height
 # Flags of EKF_STATUS_REPORT: relative or absolute position, and an assumed one.
 _EKF_POSITION, _EKF_ASSUMED = 8 | 16, 128
@@ -146,6 +150,8 @@ class Estimate:
         self._on_restart = on_restart
         self.dropped: Counter[str] = Counter()
         self.charge_reports = 0
+        # Times of the last restarts, which those of several autopilots with one ID look like.
+        self._restarts: deque[float] = deque(maxlen=_RESTARTS)
         self._clear()
 
     def _clear(self) -> None:
@@ -164,6 +170,12 @@ class Estimate:
         self._boot_time: int | None = None
         self._position: tuple[int, tuple[float, ...]] | None = None
         self._attitude = (np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(3))
+
+    @property
+    def several(self) -> bool:
+        """Whether times since boot alternate, as those of several autopilots."""
+        times = self._restarts
+        return len(times) == _RESTARTS and times[-1] - times[0] < _ALTERNATING
 
     @property
     def has_fix(self) -> bool:
@@ -238,6 +250,7 @@ class Estimate:
         """Detect a restart by a decrease of the time since boot."""
         if self._boot_time is not None and milliseconds < self._boot_time - _RESTART:
             self._clear()
+            self._restarts.append(now)
             self._on_restart()
         else:
             self.received_at = now

@@ -60,7 +60,8 @@ class Vehicle(Autopilot):
         self._fix_needed = False
         self._ending: Ending | None = None
         self._reason = ''  # why it lands by itself
-        self._displaced = False  # restarted after a flight: its local frame is undefined
+        # Why its local frame is undefined: restarted after a flight, or not the only one.
+        self._displaced = ''
 
     @property
     def flying(self) -> bool:
@@ -168,7 +169,7 @@ class Vehicle(Autopilot):
         if self.phase in (VehiclePhase.RISING, VehiclePhase.FLYING):
             return 'it is in the air already'
         if self._displaced:
-            return 'the autopilot has restarted: restart the driver'
+            return f'{self._displaced}: restart the driver'
         if self.lost or self.flight_origin.problem or self.phase in UNABLE:
             return self.fault
         if self.armed and self.firmware is not None and not self.in_external_mode:
@@ -256,14 +257,22 @@ class Vehicle(Autopilot):
     def on_restart(self) -> None:
         """Start again with a restarted autopilot, whose local frame is new."""
         text = 'the autopilot has restarted'
-        self.log.add(WARNING, text)
+        if self.estimate.several:
+            text = (
+                f'several autopilots answer as system {self.settings.system}: give each an ID of '
+                'its own (ArduPilot: SYSID_THISMAV or MAV_SYSID, PX4: MAV_SYS_ID)'
+            )
+        if self._displaced == text:
+            return
+        self.log.add(ERROR if self.estimate.several else WARNING, text)
         self.commands.clear()
         self._permission.end()
-        if self.phase in (VehiclePhase.CONNECTING, VehiclePhase.PREPARING, VehiclePhase.WAITING):
+        before = (VehiclePhase.CONNECTING, VehiclePhase.PREPARING, VehiclePhase.WAITING)
+        if self.phase in before and not self.estimate.several:
             self.read_failsafes()
             self._enter(VehiclePhase.PREPARING)
         else:
-            self._displaced = True
+            self._displaced = text
             self._enter(VehiclePhase.STOPPED, f'{text}: restart the driver')
 
     def tick(self, now: float) -> None:
