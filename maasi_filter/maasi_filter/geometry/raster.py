@@ -121,7 +121,8 @@ def cells_of(file: Any, origin: OriginSettings) -> Cells:
     from rasterio.warp import transform
 
     crs, (a, b, c, d, e, f) = file.crs, list(~file.transform)[:6]
-    middle, _ = file.transform * (0.5 * file.width, 0.5 * file.height)
+    west, along, down = file.transform.c, file.transform.a, file.transform.b
+    middle = west + 0.5 * (along * file.width + down * file.height)
 
     def cells(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
         degrees = geodetic(np.stack([x.ravel(), y.ravel()], axis=1), origin)
