@@ -85,7 +85,7 @@ def test_a_browser_saw_the_run_while_it_went_on(run):
     assert run.answer == 'pause: turtlebot'
     # What robots have done so far is below the time line of a live run, too.
     assert [strip.partition(':')[0] for strip in run.strips] == ['mambo', 'turtlebot']
-    assert all('moving' in strip and ' measurements' in strip for strip in run.strips)
+    assert all('moving' in strip and ' measurement' in strip for strip in run.strips)
     # Nobody follows after the end.
     assert not run.controls
     assert 'limits.time' in run.headline
