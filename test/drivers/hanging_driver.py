@@ -2,7 +2,8 @@
 
 import signal
 
-from maasi_drivers.drivers import turtlebot_driver
+from maasi_drivers.drivers import TurtlebotDriver
+from maasi_filter.ros.run_node import run
 
 
 def hang(number, frame):
@@ -13,4 +14,4 @@ def hang(number, frame):
 
 if __name__ == '__main__':
     signal.signal(signal.SIGUSR1, hang)
-    raise SystemExit(turtlebot_driver())
+    raise SystemExit(run(TurtlebotDriver))
