@@ -4,103 +4,60 @@ import time
 
 import numpy as np
 import pyscipopt
-from pyscipopt import quicksum
 
 from maasi_planner.buildings.problem import TOUCH
 
 BIG = 1000.0
 
 
-def checked_objective(solver, problem, plan, tolerance=2e-4):
-    """Return the objective of a lean plan, after checking all that it must satisfy."""
-    d, s = solver.dynamics, solver.settings
-    P, v, u = plan.positions, plan.velocities, plan.controls
-    assert np.abs(P[1:] - P[:-1] - d.step * v[:-1]).max() <= tolerance
-    change = d.step / d.mass * (u - d.weight)
-    assert np.abs(v[1:] - d.retained * v[:-1] - change).max() <= tolerance
-    for values, low, high in (
-        (P[0], problem.position, problem.position),
-        (P[2:], *problem.area.T),
-        (v[0], problem.velocity, problem.velocity),
-        (v[1:], -d.speed, d.speed),
-        (u, -d.force, d.force),
-    ):
-        assert (low - tolerance <= values).all() and (values <= high + tolerance).all()
-    for a in range(3 if s.brake_at_end else 0):
-        for factor, up, down in stops(d, a):
-            low, high = problem.area[a] + [-down - tolerance, up + tolerance]
-            assert low <= P[-1, a] + factor * v[-1, a] <= high
-    total = s.guidance_weight * ((P[s.guided] - problem.target) ** 2).sum()
-    total += s.smoothness_weight * (np.diff(u, axis=0) ** 2).sum()
-    cuboids = [cuboid for _, cuboid in plan.visits]
-    assert len(set(cuboids)) == len(cuboids) and problem.wanted[cuboids].all()
-    for step, cuboid in plan.visits:
-        box = problem.cuboids[cuboid]
-        assert (P[step] >= box[:, 0] - tolerance).all()
-        assert (P[step] <= box[:, 1] + tolerance).all()
-        total -= s.rewards()[step]
-    for k in range(2, s.horizon + 1):
-        ends = P[k - s.between_samples : k + 1]
-        for box in problem.obstacles:
-            below = (ends <= box[:, 0] + 2e-3).all(axis=0)
-            assert (below | (ends >= box[:, 1] - 2e-3).all(axis=0)).any(), (k, ends, box)
-    return total
-
-
-def stops(d, a):
-    """Return way = P + factor v - up (moving up), + down (moving down), after each step."""
-    result = []
-    for steps in range(1, d.braking_steps() + 1):
-        # v -> way, by simulating v = 0 and v = 1 without stopping.
-        ways = np.zeros((2, 2))
-        for way, loss in zip(ways, d.deceleration[:, a]):
-            speeds = np.array([0.0, 1.0])
-            for _ in range(steps):
-                way += d.step * speeds
-                speeds = d.retained * speeds - loss
-        result.append((ways[0, 1] - ways[0, 0], -ways[0, 0], -ways[1, 0]))
-    return result
-
-
 class MixedProblem:
-    """Variables P (T + 1, 3), v and u (T, 3), and constraints of P2 in `model`."""
+    """Columns and rows of P2; `squares` are (weight, columns, coefficients, constant)."""
 
-    def __init__(self, solver, problem, apart):
+    def __init__(self, solver, problem, apart=False):
         self.dynamics, self.settings, self.problem = solver.dynamics, solver.settings, problem
         # Whether no two cuboids can be visited at one step.
         self.apart = apart
-        self.model = pyscipopt.Model()
-        self.model.hideOutput()
-        self.add = self.model.addCons
-        self._dynamics()
-        rewards = self._visits()
-        self._obstacles()
+        self.lower, self.upper, self.integer, self.cost = [], [], [], []
+        self.rows = []
+        self.squares = []
+        self._dynamics_rows()
+        self._visit_rows()
+        self._obstacle_rows()
         if self.settings.brake_at_end:
-            self._braking()
-        self.model.setObjective(quicksum([*self._squares(), *rewards]), 'minimize')
+            self._braking_rows()
+        self._objective()
 
-    def _variable(self, lower, upper):
-        return self.model.addVar(vtype='C', lb=lower, ub=upper)
+    def column(self, lower, upper, integer=False, cost=0.0):
+        self.lower.append(lower)
+        self.upper.append(upper)
+        self.integer.append(integer)
+        self.cost.append(cost)
+        return len(self.cost) - 1
 
-    def _binary(self):
-        return self.model.addVar(vtype='B')
+    def binary(self, cost=0.0):
+        return self.column(0, 1, True, cost)
 
-    def _dynamics(self):
+    def row(self, columns, coefficients, lower, upper):
+        self.rows.append((list(columns), list(coefficients), lower, upper))
+
+    def _dynamics_rows(self):
         d, T, p = self.dynamics, self.settings.horizon, self.problem
-        self.P, self.v = np.empty((2, T + 1, 3), dtype=object)
-        self.u = np.empty((T, 3), dtype=object)
+        self.P = np.empty((T + 1, 3), dtype=int)
+        self.v = np.empty((T + 1, 3), dtype=int)
+        self.u = np.empty((T, 3), dtype=int)
+        gamma = d.step / d.mass
         for a in range(3):
             for k in range(T + 1):
                 # P_1 is given by the state, too.
                 bounds = [(p.position[a],) * 2, (-1e6, 1e6), p.area[a]][min(k, 2)]
-                self.P[k, a] = self._variable(*bounds)
+                self.P[k, a] = self.column(*bounds)
                 bounds = (p.velocity[a],) * 2 if k == 0 else (-d.speed, d.speed)
-                self.v[k, a] = self._variable(*bounds)
+                self.v[k, a] = self.column(*bounds)
             for k in range(T):
-                u = self.u[k, a] = self._variable(-d.force, d.force)
-                self.add(self.P[k + 1, a] == self.P[k, a] + d.step * self.v[k, a])
-                change = d.step / d.mass * (u - d.weight[a])
-                self.add(self.v[k + 1, a] == d.retained * self.v[k, a] + change)
+                u = self.u[k, a] = self.column(-d.force, d.force)
+                self.row([self.P[k + 1, a], self.P[k, a], self.v[k, a]], [1, -1, -d.step], 0, 0)
+                fall = -gamma * d.weight[a]
+                self.row([self.v[k + 1, a], self.v[k, a], u], [1, -d.retained, -gamma], fall, fall)
 
     def _reach(self):
         d, T, p = self.dynamics, self.settings.horizon, self.problem
@@ -115,11 +72,11 @@ class MixedProblem:
         reach[2:, :, 1] = np.minimum(reach[2:, :, 1], p.area[:, 1])
         return reach
 
-    def _visits(self):
-        """Return the terms of the objective that visits gain."""
+    def _visit_rows(self):
         T, p = self.settings.horizon, self.problem
         self.reach = self._reach()
-        rewards, terms, possible = self.settings.rewards(), [], {}
+        rewards = self.settings.rewards()
+        possible = {}
         for n in np.flatnonzero(p.wanted):
             visits = []
             for k in range(1, T + 1):
@@ -127,22 +84,21 @@ class MixedProblem:
                 # Where the next step leads is given: a visit on a face counts despite rounding.
                 box = p.cuboids[n] + [-TOUCH, TOUCH] if k == 1 else p.cuboids[n]
                 if (box[:, 0] <= high).all() and (box[:, 1] >= low).all():
-                    visits.append(self._binary())
-                    terms.append(-rewards[k] * visits[-1])
-                    key = k, None if self.apart else n
-                    possible.setdefault(key, []).append((visits[-1], box))
+                    beta = self.binary(-rewards[k])
+                    visits.append(beta)
+                    possible.setdefault((k, None if self.apart else n), []).append((beta, box))
             if len(visits) > 1:
-                self.add(quicksum(visits) <= 1)
+                self.row(visits, [1] * len(visits), -np.inf, 1)
         for (k, _), betas in possible.items():
+            columns = [beta for beta, _ in betas]
             for a in range(3):
                 low, high = self.reach[k, a]
-                lifts = quicksum(max(box[a, 0] - low, 0.0) * beta for beta, box in betas)
-                drops = quicksum(max(high - box[a, 1], 0.0) * beta for beta, box in betas)
-                self.add(self.P[k, a] >= low + lifts)
-                self.add(self.P[k, a] <= high - drops)
-        return terms
+                lifts = [max(box[a, 0] - low, 0.0) for _, box in betas]
+                drops = [max(high - box[a, 1], 0.0) for _, box in betas]
+                self.row([self.P[k, a], *columns], [1, *(-x for x in lifts)], low, np.inf)
+                self.row([self.P[k, a], *columns], [1, *drops], -np.inf, high)
 
-    def _obstacles(self):
+    def _obstacle_rows(self):
         T, p = self.settings.horizon, self.problem
         for box in p.obstacles:
             for k in range(2, T + 1):
@@ -158,51 +114,118 @@ class MixedProblem:
                         nearest = (low, -high)[side][a]
                         if face <= sign * p.area[a, side] or nearest > face:
                             continue
-                        faces.append(self._binary())
+                        z = self.binary()
+                        faces.append(z)
                         for i in steps:
                             most = max(sign * self.reach[i, a, 1 - side] - face, 0.0)
-                            self.add(sign * self.P[i, a] <= face + most * faces[-1])
-                self.add(quicksum(faces) <= len(faces) - 1)
+                            self.row([self.P[i, a], z], [sign, -most], -np.inf, face)
+                self.row(faces, [1] * len(faces), -np.inf, len(faces) - 1)
 
-    def _braking(self):
+    def _braking_rows(self):
         """The way to brake, each axis with full force, stays in the area and beyond a face."""
-        p, ways = self.problem, []
+        T, p = self.settings.horizon, self.problem
+        ends = [[self.P[T, a], self.v[T, a]] for a in range(3)]
         for a in range(3):
-            end, speed = self.P[-1, a], self.v[-1, a]
-            found = [(end + f * speed, up, down) for f, up, down in stops(self.dynamics, a)]
-            for way, up, down in found:
-                self.add(way >= p.area[a, 0] - down)
-                self.add(way <= p.area[a, 1] + up)
-            ways.append([(1.0 * end, 0.0, 0.0), *found])
+            for factor, up, down in self._stops(a):
+                self.row(ends[a], [1, factor], p.area[a, 0] - down, np.inf)
+                self.row(ends[a], [1, factor], -np.inf, p.area[a, 1] + up)
         for box in p.obstacles:
             # Of the six faces one is kept beyond.
-            z = np.array([self._binary() for _ in range(6)]).reshape(3, 2)
-            self.add(quicksum(z.ravel()) <= 5)
+            z = np.array([self.binary() for _ in range(6)]).reshape(3, 2)
+            self.row(z.ravel(), [1] * 6, -np.inf, 5)
             for a in range(3):
-                for way, up, down in ways[a]:
-                    self.add(way <= box[a, 0] + up + BIG * z[a, 0])
-                    self.add(way >= box[a, 1] - down - BIG * z[a, 1])
+                for factor, up, down in ((0.0, 0.0, 0.0), *self._stops(a)):
+                    below, above = ([*ends[a], column] for column in z[a])
+                    self.row(below, [1, factor, -BIG], -np.inf, box[a, 0] + up)
+                    self.row(above, [1, factor, BIG], box[a, 1] - down, np.inf)
 
-    def _squares(self):
-        """Yield the squares of the objective, each as a variable: its relaxation is tighter."""
+    def _stops(self, a):
+        """Return way = P + factor v - up (moving up), + down (moving down), after each step."""
+        d = self.dynamics
+        result = []
+        for steps in range(1, d.braking_steps() + 1):
+            # v -> way, by simulating v = 0 and v = 1 without stopping.
+            ways = np.zeros((2, 2))
+            for way, loss in zip(ways, d.deceleration[:, a]):
+                speeds = np.array([0.0, 1.0])
+                for _ in range(steps):
+                    way += d.step * speeds
+                    speeds = d.retained * speeds - loss
+            result.append((ways[0, 1] - ways[0, 0], -ways[0, 0], -ways[1, 0]))
+        return result
+
+    def _objective(self):
         T, p, s = self.settings.horizon, self.problem, self.settings
         for a in range(3):
-            parts = [(s.guidance_weight, self.P[s.guided, a] - p.target[a])]
-            parts += [(s.smoothness_weight, self.u[k, a] - self.u[k - 1, a]) for k in range(1, T)]
-            for weight, part in parts:
-                inner, square = self._variable(None, None), self._variable(0.0, None)
-                self.add(inner == part)
-                self.add(weight * inner * inner <= square)
-                yield square
+            self.squares.append((s.guidance_weight, [self.P[s.guided, a]], [1.0], -p.target[a]))
+            for k in range(1, T):
+                pair = [self.u[k, a], self.u[k - 1, a]]
+                self.squares.append((s.smoothness_weight, pair, [1.0, -1.0], 0.0))
+
+    def value(self, x):
+        total = float(np.dot(self.cost, x))
+        for weight, columns, coefficients, constant in self.squares:
+            total += weight * (np.dot(coefficients, x[columns]) + constant) ** 2
+        return total
+
+    def check(self, plan, tolerance=2e-4):
+        """Return the objective of a lean plan, after checking all rows that do not choose."""
+        x = np.zeros(len(self.cost))
+        x[self.P], x[self.v], x[self.u] = plan.positions, plan.velocities, plan.controls
+        for columns, coefficients, lower, upper in self.rows:
+            if not any(self.integer[c] for c in columns):
+                value = np.dot(coefficients, x[columns])
+                assert lower - tolerance <= value <= upper + tolerance
+        continuous = ~np.array(self.integer)
+        assert (x[continuous] >= np.array(self.lower)[continuous] - tolerance).all()
+        assert (x[continuous] <= np.array(self.upper)[continuous] + tolerance).all()
+        total = self.value(x)
+        cuboids = [cuboid for _, cuboid in plan.visits]
+        assert len(set(cuboids)) == len(cuboids) and self.problem.wanted[cuboids].all()
+        for step, cuboid in plan.visits:
+            box = self.problem.cuboids[cuboid]
+            assert (plan.positions[step] >= box[:, 0] - tolerance).all()
+            assert (plan.positions[step] <= box[:, 1] + tolerance).all()
+            total -= self.settings.rewards()[step]
+        for k in range(2, self.settings.horizon + 1):
+            ends = plan.positions[k - self.settings.between_samples : k + 1]
+            for box in self.problem.obstacles:
+                below = (ends <= box[:, 0] + 2e-3).all(axis=0)
+                assert (below | (ends >= box[:, 1] - 2e-3).all(axis=0)).any(), (k, ends, box)
+        return total
 
 
-def solve_with_scip(solver, problem, apart=False, gap=1e-6, limit=60.0):
+def solve_with_scip(mixed, gap=1e-6, limit=60.0):
     """Return (lower bound, value of the best point found, seconds) of SCIP."""
     begun = time.perf_counter()
-    model = MixedProblem(solver, problem, apart).model
+    model = pyscipopt.Model()
+    model.hideOutput()
     model.setParam('limits/time', limit)
     model.setParam('limits/absgap', gap)
     model.setParam('parallel/maxnthreads', 1)
+    columns = [
+        model.addVar(vtype='B' if kind else 'C', lb=low, ub=high)
+        for low, high, kind in zip(mixed.lower, mixed.upper, mixed.integer)
+    ]
+
+    def total(indices, coefficients):
+        return pyscipopt.quicksum(c * columns[i] for i, c in zip(indices, coefficients))
+
+    for indices, coefficients, low, high in mixed.rows:
+        value = total(indices, coefficients)
+        if low > -np.inf:
+            model.addCons(value >= low)
+        if high < np.inf:
+            model.addCons(value <= high)
+    # A column for each square: as one row, its relaxation is far weaker.
+    squares = []
+    for weight, indices, coefficients, constant in mixed.squares:
+        inner = model.addVar(vtype='C', lb=None, ub=None)
+        model.addCons(inner == total(indices, coefficients) + constant)
+        squares.append(model.addVar(vtype='C', lb=0.0, ub=None))
+        model.addCons(weight * inner * inner <= squares[-1])
+    linear = total(range(len(columns)), mixed.cost)
+    model.setObjective(linear + pyscipopt.quicksum(squares), 'minimize')
     model.optimize()
     value = model.getObjVal() if model.getNSols() else np.inf
     return model.getDualbound(), value, time.perf_counter() - begun

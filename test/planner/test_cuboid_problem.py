@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from cuboid_instances import problems_of_missions, random_problem, solver_for
-from mixed_cuboid import checked_objective, solve_with_scip
+from mixed_cuboid import MixedProblem, solve_with_scip
 
 from maasi_planner.buildings import problem as problem_module
 from maasi_planner.buildings.preplanning import segment_cuts
@@ -15,13 +15,14 @@ from maasi_planner.buildings.problem import Problem, solve_jointly
 
 def same_optimum(solver, problem):
     """Assert that the lean solution is the optimum; return whether there is one."""
-    bound, value, _ = solve_with_scip(solver, problem)
+    mixed = MixedProblem(solver, problem)
+    bound, value, _ = solve_with_scip(mixed)
     plan = solver.solve(problem)
     if plan is None:
         assert value == np.inf
         return False
     assert plan.how == 'optimal'
-    objective = checked_objective(solver, problem, plan)
+    objective = mixed.check(plan)
     assert objective == pytest.approx(plan.objective, abs=1e-6)
     assert bound - 1e-4 <= objective <= value + 1e-4
     return True
@@ -127,7 +128,7 @@ def test_a_given_visit_counts_despite_rounding(x, due):
     plan = solver.solve(problem)
     ((step, cuboid),) = plan.visits
     assert cuboid == 0 and (step == 1) == due
-    assert checked_objective(solver, problem, plan) == pytest.approx(plan.objective, abs=1e-6)
+    assert MixedProblem(solver, problem).check(plan) == pytest.approx(plan.objective, abs=1e-6)
 
 
 @pytest.mark.parametrize('beyond', [0.0, 1e-6, 5e-5])
