@@ -253,7 +253,7 @@ def test_the_command_writes_both_files_and_says_what_differs(tmp_path, capsys):
 
 
 def test_any_name_of_a_world_is_one_of_gazebo_and_a_command_of_a_shell(tmp_path, capsys):
-    """What the file of an area leaves out is told as a line, without the line of our source."""
+    """What the file of an area leaves out is printed as a line, without the line of our source."""
     area = {'type': 'Polygon', 'coordinates': [[[0, 0], [1e-4, 0], [1e-4, 1e-4], [0, 0]]]}
     line = {'type': 'LineString', 'coordinates': [[0, 0], [1, 1]]}
     rows = [{'type': 'Feature', 'properties': {}, 'geometry': shape} for shape in (area, line)]

@@ -259,8 +259,8 @@ class Vehicle(Autopilot):
         text = 'the autopilot has restarted'
         if self.estimate.several:
             text = (
-                f'several autopilots answer as system {self.settings.system}: give each an ID of '
-                'its own (ArduPilot: SYSID_THISMAV or MAV_SYSID, PX4: MAV_SYS_ID)'
+                f'several autopilots answer as system {self.settings.system}: give each its own '
+                'ID (ArduPilot: SYSID_THISMAV or MAV_SYSID, PX4: MAV_SYS_ID)'
             )
         if self._displaced == text:
             return
